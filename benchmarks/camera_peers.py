@@ -41,8 +41,8 @@ class WholeProblem:
         self.robot, self.draw = start, draw
         self.count = len(draw.images.names)
         self.pixels = np.concatenate(draw.images.pixels)
-        self.image = np.repeat(np.arange(self.count), [len(one) for one in draw.images.corners])
-        self.corners = BOARD.corners[np.concatenate(draw.images.corners)]
+        self.image = np.repeat(np.arange(self.count), [len(one) for one in draw.images.corner_numbers])
+        self.corners = BOARD.corners[np.concatenate(draw.images.corner_numbers)]
         self.shared = start.dh.size + 12 + len(FREE)
 
     @property

@@ -179,7 +179,7 @@ def bent(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
     true = arm.with_frames(IN_BASE, ON_FLANGE.numpy())
     bowed = bent_corners(BOARD, BOW)
     for T, number, flat in zip(
-        invert(forward_kinematics(true, q)).numpy(), images.corners, images.pixels, strict=True
+        invert(forward_kinematics(true, q)).numpy(), images.corner_numbers, images.pixels, strict=True
     ):
         here = (CAMERA.project(at[number] @ T[:3, :3].T + T[:3, 3])[0] for at in (bowed, BOARD.corners))
         pixels.append(flat + np.subtract(*here))

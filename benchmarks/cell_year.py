@@ -93,7 +93,7 @@ class Year:
         found = self.cell.monitor().sessions[-1]
         named = {one["what"] for one in found.to_json()["moved"]}
         others = [self.error(before)]
-        others += [self.error(recalibrate(before, self.cell.sessions.as_measured(entry)).model)]
+        others += [self.error(recalibrate(before, self.cell.sessions.rows_of_file(entry)).model)]
         if self.cell.status().step.state in ("moved", "older_than_evidence"):
             self.cell.recalibrate()
         # a session of last winter is verified again on this day

@@ -192,7 +192,7 @@ def close_loop(
     """Measure the planned poses, calibrate, verify, and compare the positions attained at `count` other poses."""
     began = time.perf_counter()
     loop = Loop(arm, case, seed, folder)
-    planned, check = plan.stored.q.numpy(), plan.stored.check.numpy()
+    planned, check = plan.stored_plan.q.numpy(), plan.stored.check.numpy()
     rows = loop.measure(planned[~check], "calibration")
     calibration, entry = loop.cell.calibrate(accept_implausible=True, folds=0)
     assert entry is not None
@@ -200,7 +200,7 @@ def close_loop(
     verification, _ = loop.cell.verify()
 
     nominal = GeometricCalibrator(loop.robot, free=()).fit(rows).robot
-    q = draw_candidates(plan.stored.arm, count, 1000 + seed).q
+    q = draw_candidates(plan.stored_plan.arm, count, 1000 + seed).q
     wanted = pisigma.forward_kinematics(nominal, q)
     ik = pisigma.load(loop.cell.model_folder(entry.name))
     solution = ik(wanted.numpy(), near=q.numpy())
@@ -217,7 +217,7 @@ def close_loop(
         rms(errors),
         float(np.quantile(errors, 0.95)),
         predicted_p95(ik.model, solution.q[found]),
-        plan.curve[-1].p95 * 1e3,
+        plan.accuracy_curve[-1].p95 * 1e3,
         rows.rows,
         int(found.sum()),
         int(outside.sum()),

@@ -109,7 +109,7 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
                 result.adaptation.problem.with_fixed_arm(), result.adaptation.noise
             ),
         }
-        figures += [rms(kept[begun.gate.kept](), test), rms(without, test)]
+        figures += [rms(kept[begun.candidate_choice.kept](), test), rms(without, test)]
     return figures
 
 

@@ -108,10 +108,10 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
     count = POSES[how]
     settings = PlanSettings(count=count, check=0, candidates=1000, sigma_mm=NOISE * 1e3)
     if how == "planned":
-        stored = plan(arm.planned, settings).stored
+        stored = plan(arm.planned, settings).stored_plan
     else:
         q = torch.from_numpy(arm.true.sample(count, 100 + arm.seed))
-        few = plan(arm.planned, replace(settings, count=1)).stored
+        few = plan(arm.planned, replace(settings, count=1)).stored_plan
         stored = replace(
             few,
             arm=ArmInSurroundings.from_robot(arm.planned),

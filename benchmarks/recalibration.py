@@ -98,7 +98,7 @@ def planned() -> None:
         rows.write_csv(candidates, Robot.load("ur10"))
         for count, asked in ASKED_OF_PLAN.items():
             settings = PlanSettings(count, check=0, candidates_from=str(candidates))
-            chosen = plan(model_of("B"), settings).stored.candidate.numpy() - 1
+            chosen = plan(model_of("B"), settings).stored_plan.candidate.numpy() - 1
             few, others = (
                 rows.select(torch.from_numpy(one)) for one in (chosen, np.setdiff1d(every, chosen))
             )
@@ -181,7 +181,7 @@ def collision() -> None:
             arm.perturb[2] = math.radians(0.25)
             result = recalibrate(model, simulated_rows(arm, arm.sample(10, 500 + seed), 77 + seed))
             ratios.append(error_of(result.model, simulated_rows(arm, check)) / error)
-            joints.append("; ".join(one.sentence for one in result.moved))
+            joints.append("; ".join(one.sentence for one in result.movements))
         shown = " ".join(f"{ratio:.2f}" for ratio in ratios)
         print(
             f"collision after a calibration with {rows} rows: {np.mean(ratios):.3f} of the error before: {shown}"

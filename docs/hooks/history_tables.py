@@ -10,7 +10,7 @@ from pathlib import Path
 
 from recipe_tables import page_with
 
-from pisigma.files.setting import attributes_of
+from pisigma.files.setting import attribute_descriptions
 from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, TABLES, History
 
 PAGE = Path(__file__).parent.parent / "reference" / "history.md"
@@ -24,7 +24,7 @@ def tables() -> str:
         history.database.upgrade()
         with closing(sqlite3.connect(history.path)) as database:
             for kind, table in TABLES.items():
-                meaning, summary = attributes_of(kind), (kind.__doc__ or "").splitlines()[0]
+                meaning, summary = attribute_descriptions(kind), (kind.__doc__ or "").splitlines()[0]
                 key = f" Key: {', '.join(f'`{name}`' for name in table.key)}." if table.key else ""
                 parts += [f"### {table.name}", "", f"{summary}{key}", ""]
                 parts += ["| column | type | meaning |", "|---|---|---|"]

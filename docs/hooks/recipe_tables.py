@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from pisigma.files.setting import attributes_of
+from pisigma.files.setting import attribute_descriptions
 from pisigma.simulation.errors.source import RegisteredSection
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 
@@ -67,7 +67,7 @@ def _closed(annotation: Any) -> Any:
 
 
 def _table(section: type[BaseModel]) -> str:
-    doc = attributes_of(section)
+    doc = attribute_descriptions(section)
     lines = [f"### {_name(section)}", "", _cell(_summary(section)), ""]
     lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
     for name, field in section.model_fields.items():

@@ -22,7 +22,7 @@ from pisigma.files.errors import (
     PisigmaError,
     make_printable,
     missing_extra,
-    system_fault,
+    system_problem_text,
 )
 from pisigma.files.plugins import load_files, load_installed
 
@@ -100,7 +100,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
         exit_with_error(str(missing))
     if isinstance(problem, KeyboardInterrupt):
         exit_with_error("interrupted; nothing was left half written.", _INTERRUPTED)
-    if fault := system_fault(problem):
+    if fault := system_problem_text(problem):
         exit_with_error(fault)
     if isinstance(problem, OSError) and problem.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EFBIG):
         _print_no_more()

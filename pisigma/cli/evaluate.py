@@ -76,7 +76,7 @@ def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
     else:
         _print(evaluation, verbose)
     if not evaluation.accepted:
-        missed = [f"not accepted: {'; '.join(evaluation.missed)}."] if evaluation.missed else []
+        missed = [f"not accepted: {'; '.join(evaluation.missed_limits)}."] if evaluation.missed_limits else []
         raise AcceptanceError(" ".join([*missed, *(one.sentence for one in evaluation.diagnostics)]))
 
 
@@ -87,7 +87,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
 
     rows = evaluation.rows
     errors = ", ".join(f"{one.name} {model_rms(one, rows)}" for one in evaluation.models)
-    fitted = [name for name, one in evaluation.evaluated.items() if one.trained_on]
+    fitted = [name for name, one in evaluation.evaluated_models.items() if one.trained_on]
     kind = f"; fit of {' and '.join(fitted)}, which these rows calibrated" if fitted else ""
     verdict = Verdict(
         f"RMS of {rows} rows: {errors}{kind}.",
@@ -95,7 +95,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
         "correct the problem named above, and evaluate again."
         if evaluation.diagnostics
         else "recalibrate with these rows (`pisigma recalibrate`), or calibrate with more."
-        if evaluation.missed
+        if evaluation.missed_limits
         else "see the intervals below for what differs by more than chance.",
     )
     warnings = [*(one.sentence for one in evaluation.diagnostics[1:]), *evaluation.warnings]
@@ -111,10 +111,10 @@ def _trust(evaluation: "Evaluation") -> str:
     """Return a sentence about whether the models were accepted."""
     from pisigma.reporting.verdict import count_text
 
-    stated, warnings = evaluation.settings.limits.stated, evaluation.warnings
+    stated, warnings = evaluation.settings.limits.stated_limits, evaluation.warnings
     cautions = f" ({count_text(len(warnings), 'warning')})" if warnings else ""
-    if evaluation.missed:
-        return f"not accepted: {'; '.join(evaluation.missed)}."
+    if evaluation.missed_limits:
+        return f"not accepted: {'; '.join(evaluation.missed_limits)}."
     if evaluation.diagnostics:
         return f"no: {evaluation.diagnostics[0].sentence}"
     if not stated:

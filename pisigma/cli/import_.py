@@ -103,8 +103,8 @@ def _write_joint_log(files: list[Path], settings: ImportSettings, out: Path, as_
 
 def _take_in(incoming: "IncomingRows", date: str, accept_implausible: bool, as_json: bool) -> None:
     """Add rows to a cell as a session."""
-    if not as_json and incoming.imported is not None:
-        print_lines(incoming.imported.sentences)
+    if not as_json and incoming.imported_rows is not None:
+        print_lines(incoming.imported_rows.sentences)
     entry, cell = incoming.add(accept_implausible, date), incoming.cell
     if as_json:
         print_json(

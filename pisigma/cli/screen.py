@@ -23,7 +23,7 @@ def print_screen(
     warnings: Sequence[str] = (),
     blocks: Sequence[Block] = (),
     details: Sequence[Block] = (),
-    closing: Sequence[str] = (),
+    closing_sentences: Sequence[str] = (),
     verbose: bool = False,
     next_step: Sequence[str] = (),
 ) -> None:
@@ -34,14 +34,14 @@ def print_screen(
         warnings: sentences; all are printed.
         blocks: tables and texts, most important first; blocks that do not fit are only named.
         details: blocks that are printed with `verbose` only.
-        closing: sentences about files that were written.
+        closing_sentences: sentences about files that were written.
         verbose: print everything.
         next_step: last lines, with the next step of a cell instead of the verdict's.
     """
     verdict = replace(verdict, next_step="") if next_step else verdict
     head = [line for label, text in verdict.lines if text for line in wrap_lines([f"{label}: {text}"], "  ")]
     cautions = wrap_lines((f"Warning: {one}" for one in merge_alike_warnings(warnings)), "  ")
-    end = wrap_lines(closing)
+    end = wrap_lines(closing_sentences)
     room = MAX_LINES - len(head) - len(cautions) - len(end) - 5
     shown, left_out = list[str](), list[str]()
     for block in (*blocks, *details) if verbose else blocks:
@@ -49,8 +49,8 @@ def print_screen(
         if verbose or len(lines) <= room - len(shown):
             shown += lines
         elif lines:
-            left_out.append(block.what)
-    left_out += [] if verbose else [block.what for block in details if _lines(block)]
+            left_out.append(block.name)
+    left_out += [] if verbose else [block.name for block in details if _lines(block)]
     names = f"Not shown: {'; '.join(dict.fromkeys(left_out))} (--verbose)." if left_out else ""
     lines = [
         *head,
@@ -75,5 +75,11 @@ def _lines(block: Block) -> list[str]:
 def print_result(result: ResultText, verbose: bool, next_step: Sequence[str] = ()) -> None:
     """Print a result; see `print_screen`."""
     print_screen(
-        result.verdict, result.warnings, result.blocks, result.details, result.closing, verbose, next_step
+        result.verdict,
+        result.warnings,
+        result.blocks,
+        result.details,
+        result.closing_sentences,
+        verbose,
+        next_step,
     )

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin
 import typer
 
 from pisigma.files.errors import SettingError
-from pisigma.files.setting import Setting, build_settings, by_key, flat_settings
+from pisigma.files.setting import Setting, build_settings, flat_settings, settings_by_key
 from pisigma.files.setting_values import read_assignments
 
 SETTINGS = "settings_by_key"
@@ -64,7 +64,7 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
             as_stated.add(one.name)
         parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type: ignore[arg-type]
         end = len(parameters)
-    known = {key: one for group, _ in groups.values() for key, one in by_key(group).items()}
+    known = {key: one for group, _ in groups.values() for key, one in settings_by_key(group).items()}
     context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)
     by_name = inspect.Parameter.KEYWORD_ONLY
     if any(one.option.is_key for one in known.values()):
@@ -77,7 +77,7 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
         running = values.pop(_CONTEXT) if context == _CONTEXT else values[context]
         stated = _stated(values, known, running)
         for name, (group, is_optional) in groups.items():
-            own = {key: stated[key] for key in by_key(group) if key in stated}
+            own = {key: stated[key] for key in settings_by_key(group) if key in stated}
             values[name] = (
                 StatedSettings(group, own) if name in as_stated else build_settings(group, own, is_optional)
             )

@@ -12,16 +12,17 @@ def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
     from pisigma.workflow.cell.transfer import upgrade as workflow
 
     done = workflow(model)
+    before, after = done.schema_before, done.schema_after
     models = [asdict(one) for one in done.models]
     if as_json and is_cell(model):
-        print_json({"cell": str(model), "before": done.before, "after": done.after, "models": models})
+        print_json({"cell": str(model), "before": before, "after": after, "models": models})
     elif as_json:
         print_json({"model": str(model), **models[0]})
     else:
-        if done.before != done.after:
-            print_lines([f"{model}: history of schema version {done.before} was upgraded to {done.after}."])
+        if before != after:
+            print_lines([f"{model}: history of schema version {before} was upgraded to {after}."])
         elif is_cell(model) and not is_cell_of_arms(model):
-            print_lines([f"The history of {model} already has the newest schema version ({done.after})."])
+            print_lines([f"The history of {model} already has the newest schema version ({after})."])
         for one in done.models:
             name = f"model '{one.name}'" if is_cell(model) else str(model)
             if one.before == one.after:

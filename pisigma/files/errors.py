@@ -141,7 +141,7 @@ class PisigmaError(Exception):
         }
         return stated | plain
 
-    def followed_by(self, text: str) -> "PisigmaError":
+    def with_text_after(self, text: str) -> "PisigmaError":
         """Return a copy of the error with a text after its message."""
         other = type(self)(f"{self}{text}")
         other.__dict__.update(self.__dict__)
@@ -289,7 +289,7 @@ _NOT_IN_IK = {
 """Modules that `pisigma` requires, and `pisigma-ik` (packaging/pisigma-ik) does not."""
 
 
-def system_fault(problem: BaseException) -> str:
+def system_problem_text(problem: BaseException) -> str:
     """Describe a file that cannot be used, or a lack of memory; return "" for every other problem."""
     if isinstance(problem, OSError) and problem.filename is not None:
         return f"{problem.filename} cannot be used: {problem.strerror}; check the path."

@@ -13,14 +13,14 @@ from pisigma.files.scratch import FILE, remove_stale_scratch, scratch_beside
 
 
 def check_output(
-    path: Path, suffixes: tuple[str, ...] = (), what: str = "", inputs: Iterable[Input] = ()
+    path: Path, suffixes: tuple[str, ...] = (), content_name: str = "", inputs: Iterable[Input] = ()
 ) -> None:
     """Check that an output file may be written, before the computation starts.
 
     Args:
         path: the file.
         suffixes: file name extensions that are allowed; () for any.
-        what: name of the contents for messages about the extension, such as "the page".
+        content_name: name of the contents for messages about the extension, such as "the page".
         inputs: files and folders that the same call reads.
 
     Raises:
@@ -29,7 +29,7 @@ def check_output(
     """
     if suffixes and path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
-        problem = f"{what} must be written to a {endings} file"
+        problem = f"{content_name} must be written to a {endings} file"
         raise _refusal(path, problem, expected=f"a {endings} file", value=path.suffix)
     try:
         if path.is_dir():

@@ -9,7 +9,7 @@ Progress = Callable[[str], None]
 """Callback that receives a short description of the current step."""
 
 
-def no_progress(what: str) -> None:
+def no_progress(message: str) -> None:
     """Ignore a progress message; the default callback."""
 
 
@@ -29,9 +29,9 @@ _STEP = re.compile(r"\b[a-z]+ (\d[\d,]*) of (\d+(?:,\d+)*)")
 """Pattern of a numbered step, such as "fold 2 of 5"."""
 
 
-def completed_fraction(what: str) -> float | None:
+def completed_fraction(message: str) -> float | None:
     """Return the share of nested steps that are complete: 0.1 for "half 1 of 2, fold 2 of 5"; None without steps."""
-    steps = [tuple(int(number.replace(",", "")) for number in one) for one in _STEP.findall(what)]
+    steps = [tuple(int(number.replace(",", "")) for number in one) for one in _STEP.findall(message)]
     share, width = 0.0, 1.0
     for number, count in steps:
         width /= max(count, 1)
@@ -39,10 +39,10 @@ def completed_fraction(what: str) -> float | None:
     return share if steps else None
 
 
-def step_name(what: str) -> str:
+def step_name(message: str) -> str:
     """Return the name of the current step without its details."""
-    last = max((match.end() for match in _STEP.finditer(what)), default=0)
-    return what[:last] if last else what.partition(": ")[0]
+    last = max((match.end() for match in _STEP.finditer(message)), default=0)
+    return message[:last] if last else message.partition(": ")[0]
 
 
 class TimeLeft:
@@ -52,11 +52,11 @@ class TimeLeft:
         self._first: tuple[float, float] | None = None
         self._last = 0.0
 
-    def after(self, what: str) -> str:
+    def after(self, message: str) -> str:
         """Return the text of the current step, with the estimated time left if the steps are numbered."""
-        share, now = completed_fraction(what), time.monotonic()
+        share, now = completed_fraction(message), time.monotonic()
         if share is None:
-            return what
+            return message
         left = ""
         if self._first is None or share < self._last:  # the first step of a stage
             self._first = (share, now)
@@ -64,7 +64,7 @@ class TimeLeft:
             begun, since = self._first
             left = f", about {_duration((now - since) * (1 - share) / (share - begun))} left"
         self._last = share
-        return f"{what}{left}"
+        return f"{message}{left}"
 
 
 def _duration(seconds: float) -> str:

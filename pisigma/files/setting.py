@@ -61,14 +61,14 @@ FILE = Option(kind=Path, read=str)
 """Annotation of settings that are paths, stored as text."""
 
 
-def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
+def as_texts(values: Iterable[object]) -> tuple[str, ...]:
     """Return several command-line values as strings."""
-    return tuple(map(str, stated))
+    return tuple(map(str, values))
 
 
-def split_names(stated: str) -> tuple[str, ...]:
+def split_names(text: str) -> tuple[str, ...]:
     """Return the names in texts that separate names by commas."""
-    return tuple(name.strip() for name in stated.split(",")) if stated else ()
+    return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 NAMES = Option(kind=str, read=split_names)
@@ -115,11 +115,11 @@ class Setting:
         """Spelling of the setting on the command line, such as "--folds" or "--set seed"."""
         return f"--set {self.key}" if self.option.is_key else self.name
 
-    def read(self, stated: Any) -> Any:
+    def read(self, value: Any) -> Any:
         """Convert a command-line value to the setting."""
         if self.option.read is not None:
-            return self.option.read(stated)
-        return stated if self.option.unit is None else stated * _UNITS[self.option.unit][1]
+            return self.option.read(value)
+        return value if self.option.unit is None else value * _UNITS[self.option.unit][1]
 
 
 @functools.cache
@@ -128,7 +128,7 @@ def settings_of(group: type) -> tuple[Setting, ...]:
 
     A setting whose type cannot be resolved, because it is imported only for type checkers, is read as text.
     """
-    meanings, found = attributes_of(group), []
+    meanings, found = attribute_descriptions(group), []
     for one in fields(group):
         module = vars(sys.modules[group.__module__])
         kind, option = _resolved(one.type, module), Option()
@@ -151,17 +151,17 @@ def flat_settings(group: type) -> tuple[Setting, ...]:
     return tuple(itertools.chain.from_iterable(parts))
 
 
-def by_key(group: type) -> dict[str, Setting]:
+def settings_by_key(group: type) -> dict[str, Setting]:
     """Return the settings of a class by their keys; see `flat_settings`."""
     return {one.key: one for one in flat_settings(group)}
 
 
-def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = False) -> Any:
+def build_settings(group: type, values: Mapping[str, Any], is_optional: bool = False) -> Any:
     """Return an instance of a class of settings.
 
     Args:
         group: class of the settings.
-        stated: values by `Setting.key`, as on a command line; other settings keep their defaults.
+        values: values by `Setting.key`, as on a command line; other settings keep their defaults.
         is_optional: whether to return None if no setting of the class is stated.
 
     Raises:
@@ -171,10 +171,10 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
     found: dict[str, Any] = {}
     for setting in settings_of(group):
         if setting.is_group:
-            if (built := build_settings(setting.kind, stated, is_optional=True)) is not None:
+            if (built := build_settings(setting.kind, values, is_optional=True)) is not None:
                 found[setting.field] = built
-        elif setting.key in stated:
-            value = stated[setting.key]
+        elif setting.key in values:
+            value = values[setting.key]
             if isinstance(value, float) and not math.isfinite(value):
                 raise SettingError(expected="a finite number", value=value, option=setting.key)
             found[setting.field] = setting.read(tuple(value) if isinstance(value, list) else value)
@@ -184,7 +184,7 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
     missing = [one for one in needed if one.field not in found]
     names = " and ".join(one.spelling for one in needed)
     if missing == needed != []:
-        given = ", ".join(one.spelling for one in flat_settings(group) if one.key in stated)
+        given = ", ".join(one.spelling for one in flat_settings(group) if one.key in values)
         raise PisigmaError(f"{names} must also be given", option=given, expected=names)
     if missing:
         raise PisigmaError(expected=f"{names} together", option=missing[0].spelling, remedy="give both")
@@ -195,10 +195,10 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         raise problem.with_option(" ".join(keys.get(word, word) for word in problem.option.split())) from None
 
 
-def attributes_of(documented: type) -> dict[str, str]:
+def attribute_descriptions(described_class: type) -> dict[str, str]:
     """Return the text of every attribute in the docstring of a class."""
     # Python 3.13 and newer remove the indentation of docstrings, as `cleandoc` does
-    lines = inspect.cleandoc(documented.__doc__ or "").partition("Attributes:")[2].splitlines()
+    lines = inspect.cleandoc(described_class.__doc__ or "").partition("Attributes:")[2].splitlines()
     found: dict[str, str] = {}
     last = ""
     for line in lines:

@@ -12,13 +12,13 @@ _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a t
 
 
 def read_assignments(
-    assignments: Iterable[str], known: Mapping[str, Setting], option: str = ""
+    assignments: Iterable[str], settings: Mapping[str, Setting], option: str = ""
 ) -> dict[str, Any]:
     """Return the values of "KEY=VALUE" by their keys; a key that appears again adds to its list.
 
     Args:
         assignments: the texts.
-        known: settings by their keys.
+        settings: settings by their keys.
         option: option that states the texts, for messages; empty for a file.
 
     Raises:
@@ -30,17 +30,17 @@ def read_assignments(
         if not sign:
             raise SettingError(expected="KEY=VALUE, such as seed=1", value=one, option=option)
         stated.setdefault(key.strip(), []).append(value)
-    return dict(checked_values(stated, known, lambda key: None))
+    return dict(checked_values(stated, settings, lambda key: None))
 
 
 def checked_values(
-    stated: Mapping[str, Any], known: Mapping[str, Setting], place_of: Callable[[str], Place | None]
+    values: Mapping[str, Any], settings: Mapping[str, Setting], place_of: Callable[[str], Place | None]
 ) -> Iterator[tuple[str, Any]]:
     """Yield keys and values, after converting every value to the type of its setting.
 
     Args:
-        stated: values by their keys, in the units of the command line.
-        known: settings by their keys.
+        values: values by their keys, in the units of the command line.
+        settings: settings by their keys.
         place_of: function that returns the place of a key in its file; None for values of the command line.
 
     Raises:
@@ -52,11 +52,11 @@ def checked_values(
         at = place_of(key)
         return SettingError(expected=expected, value=value, at=at, option="" if at else key, **texts)
 
-    for key, value in stated.items():
-        if key not in known:
-            problem, remedy = f"unknown key '{key}'", nearest_choice(key, known)
-            raise setting_error(key, key, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
-        kind = known[key].kind
+    for key, value in values.items():
+        if key not in settings:
+            problem, remedy = f"unknown key '{key}'", nearest_choice(key, settings)
+            raise setting_error(key, key, f"one of {', '.join(settings)}", problem=problem, remedy=remedy)
+        kind = settings[key].kind
         single = _listed(value, kind)
         several = single if isinstance(single, list | tuple) else (single,)
         # pydantic would read true as 1
@@ -66,7 +66,7 @@ def checked_values(
             converted = TypeAdapter(kind).validate_python(single)
         except ValidationError:
             raise setting_error(key, single, _type_text(kind)) from None
-        if missed := _missed_bounds(known[key], converted):
+        if missed := _missed_bounds(settings[key], converted):
             raise setting_error(key, single, missed)
         yield key, converted
 

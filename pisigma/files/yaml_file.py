@@ -99,7 +99,7 @@ for _tag, _pattern, _first in (
         _loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
 
 
-def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:
+def parse_plain_yaml(text: str, error: type[PisigmaError], source: str) -> Any:
     """Parse YAML text as plain values, for documents whose format must first be determined.
 
     Raises:
@@ -208,7 +208,7 @@ def _error_of(
     others = len(errors) - 1
     if not others:
         return found
-    return found.followed_by(f" {others} more mistake{'s' if others > 1 else ''} in this file.")
+    return found.with_text_after(f" {others} more mistake{'s' if others > 1 else ''} in this file.")
 
 
 def _error_at(

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from pisigma.files.errors import PisigmaError, Place
-from pisigma.files.yaml_file import PlainLoader, plain_content
+from pisigma.files.yaml_file import PlainLoader, parse_plain_yaml
 
 Keys = Sequence[str | int]
 _INDENT = 2
@@ -33,7 +33,7 @@ def yaml_text(content: Any, in_one_line: bool = False) -> str:
     return text.removesuffix("\n").removesuffix("\n...") if in_one_line else text
 
 
-def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
+def with_changed_value(text: str, keys: Keys, value: Any, source: str) -> str:
     """Return the text of a YAML file after a change of one value.
 
     A missing key is added before the comment that states its default ("# folds: 5"), or else at the end of its section.
@@ -50,12 +50,12 @@ def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
         PisigmaError: the text is written in such a way that this value cannot be changed alone.
     """
     text = text if text.endswith("\n") else f"{text}\n"
-    before = plain_content(text, PisigmaError, source)
+    before = parse_plain_yaml(text, PisigmaError, source)
     wanted = _changed(before, keys, value)
     if wanted == before:
         return text
     changed = _edited(text, keys, value, wanted)
-    if plain_content(changed, PisigmaError, source) != wanted:
+    if parse_plain_yaml(changed, PisigmaError, source) != wanted:
         at = Place(source, None, ".".join(map(str, keys)))
         raise PisigmaError("this value cannot be changed alone", at=at, remedy="change it in the text")
     return changed

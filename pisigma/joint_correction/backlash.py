@@ -45,14 +45,14 @@ class Backlash(AbstractFeature):
     @classmethod
     def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["Backlash", ...]:
         """Return the feature if any joint was approached from both sides, otherwise an empty tuple."""
-        approach = state.stated.get(APPROACH)
+        approach = state.conditions.get(APPROACH)
         if approach is None or not bool(((approach > 0).any(0) & (approach < 0).any(0)).any()):
             return ()
         return (Backlash(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return one column per joint, the joint's approach direction."""
-        approach = state.stated.get(APPROACH)
+        approach = state.conditions.get(APPROACH)
         if approach is None:
             return torch.zeros_like(state.q)[..., None]
         return approach.to(state.q).nan_to_num(0.0).expand(state.q.shape)[..., None]

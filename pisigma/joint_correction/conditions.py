@@ -101,7 +101,7 @@ class ConditionFeatures(AbstractFeature):
         """Return the feature if a condition varies, otherwise an empty tuple."""
         if not options.varying:
             return ()
-        values = torch.stack([state.stated[name] for name in options.varying], 1)
+        values = torch.stack([state.conditions[name] for name in options.varying], 1)
         mean, spread = values.mean(0).tolist(), values.std(0).tolist()
         measured = [(float(low), float(high)) for low, high in zip(*values.aminmax(dim=0), strict=True)]
         return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
@@ -109,11 +109,11 @@ class ConditionFeatures(AbstractFeature):
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return products of conditions and functions of the joint values; 0 for mean, missing or NaN conditions."""
         q = state.q
-        if not any(name in state.stated for name in self.names):
+        if not any(name in state.conditions for name in self.names):
             return q.new_zeros((*q.shape, self.count))
         missing = torch.full_like(q[..., 0], torch.nan)
         scaled = self.scaled_conditions(
-            torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1)
+            torch.stack([state.conditions.get(name, missing).to(q) for name in self.names], -1)
         )
         turning = torch.tensor(self.robot.revolute, device=q.device)
         sine = torch.where(turning, q.sin(), scaled_joints(self.robot, q))

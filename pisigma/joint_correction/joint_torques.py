@@ -98,7 +98,7 @@ class JointTorques(AbstractFeature):
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["JointTorques", ...]:
         """Return the feature, with modelled torques fitted to measured torques, if the torque of a joint varies."""
-        torque = state.stated.get(TORQUE)
+        torque = state.conditions.get(TORQUE)
         if torque is None:
             return ()
         columns = GravityTorques(robot, options.gravity).columns(state)
@@ -121,7 +121,7 @@ class JointTorques(AbstractFeature):
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return the torques, stated or modelled, divided by their scale."""
         q, modelled = state.q, self.modelled(state)
-        stated = state.stated.get(TORQUE)
+        stated = state.conditions.get(TORQUE)
         torque = modelled
         if stated is not None:
             stated = stated.to(q).expand(q.shape)
@@ -140,7 +140,7 @@ class JointTorques(AbstractFeature):
         variance, directions = torch.linalg.eigh(q.new_tensor(self.covariance))
         compliance = weight[:, 0].to(q) * self._per_scale(q)
         root: Tensor = compliance[:, None] * directions * variance.clamp(min=0).sqrt()
-        stated = state.stated.get(TORQUE)
+        stated = state.conditions.get(TORQUE)
         known = torch.zeros_like(q) if stated is None else torch.isfinite(stated.to(q).expand(q.shape)).to(q)
         root = root * (1 - known)[..., None]
         return root

@@ -16,12 +16,12 @@ CONDITIONS = ("payload_kg", "temperature_c")
 _MIN_SPREAD = 1e-9
 """Smallest range of a condition [kg or deg C] over which its effect can be identified."""
 APPROACH = "approach"
-"""Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
-0 or NaN if not stated."""
+"""Key of `JointState.conditions`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it
+decreased; 0 or NaN if not stated."""
 
 TORQUE = "torque"
-"""Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
-stated."""
+"""Key of `JointState.conditions`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if
+not stated."""
 _TORQUE_STEP = 0.2
 """Difference of torques that shows a different load of the arm, relative to the standard deviation, over all rows, of
 the torque that varies most; the torque of a joint that gravity does not load varies only by its noise."""
@@ -35,12 +35,12 @@ class JointState:
 
     Attributes:
         q: joint values [rad or m].
-        stated: `CONDITIONS` `(*batch,)` [kg, deg C], `APPROACH` and `TORQUE` `(*batch, dof)` by name. A missing entry
-            or NaN stands for the mean condition, the middle of the backlash, or a modelled torque.
+        conditions: `CONDITIONS` `(*batch,)` [kg, deg C], `APPROACH` and `TORQUE` `(*batch, dof)` by name. A missing
+            entry or NaN stands for the mean condition, the middle of the backlash, or a modelled torque.
     """
 
     q: Float[Tensor, "*batch dof"]
-    stated: Mapping[str, Tensor] = field(default_factory=dict)
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)
 
     @staticmethod
     def from_measurements(measurements: Measurements) -> "JointState":
@@ -57,7 +57,7 @@ class JointState:
 
     def __getitem__(self, rows: slice | Tensor) -> "JointState":
         """Return the rows that a slice, index or mask of the first axis selects."""
-        return JointState(self.q[rows], {name: values[rows] for name, values in self.stated.items()})
+        return JointState(self.q[rows], {name: values[rows] for name, values in self.conditions.items()})
 
     def split_rows(self, size: int) -> Iterator["JointState"]:
         """Yield at most `size` rows at a time."""
@@ -75,7 +75,7 @@ def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
 
 def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[Tensor, "rows _conditions"]:
     """Return the conditions of every row [kg, deg C]; NaN if a row does not state one."""
-    stated = JointState.from_measurements(measurements).stated
+    stated = JointState.from_measurements(measurements).conditions
     missing = torch.full((measurements.rows,), torch.nan, dtype=torch.float64, device=measurements.q.device)
     stacked = [stated.get(name, missing) for name in names]
     return torch.stack(stacked, 1) if stacked else missing.new_zeros((measurements.rows, 0))

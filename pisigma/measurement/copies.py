@@ -62,15 +62,15 @@ class RowValues:
     Attributes:
         numbers: values of the controller's axes [rad or m]; the measured length in up to three coordinates [SI]; and
             the first two columns of the measured rotation. NaN where nothing was measured.
-        steps: rounding steps of revolute axes [rad], prismatic axes [m], length [m] and rotation [rad].
-        kind: for every column of `numbers`, its column of `steps`.
-        file: index of the file from which a row comes.
+        rounding_steps: rounding steps of revolute axes [rad], prismatic axes [m], length [m] and rotation [rad].
+        step_index: for every column of `numbers`, its column of `rounding_steps`.
+        file_index: index of the file from which a row comes.
     """
 
     numbers: Float64[Tensor, "rows numbers"]
-    steps: Float64[Tensor, "rows 4"]
-    kind: Int64[Tensor, " numbers"]
-    file: Int64[Tensor, " rows"]
+    rounding_steps: Float64[Tensor, "rows 4"]
+    step_index: Int64[Tensor, " numbers"]
+    file_index: Int64[Tensor, " rows"]
 
     @staticmethod
     def from_rows(rows: MeasuredFields, robot: Robot) -> "RowValues":
@@ -99,21 +99,23 @@ class RowValues:
 
     def select(self, rows: Tensor) -> "RowValues":
         """Return the rows that an index selects."""
-        return RowValues(self.numbers[rows], self.steps[rows], self.kind, self.file[rows])
+        return RowValues(
+            self.numbers[rows], self.rounding_steps[rows], self.step_index, self.file_index[rows]
+        )
 
     def __add__(self, other: "RowValues") -> "RowValues":
         """Return the rows followed by rows of other files."""
         return RowValues(
             torch.cat([self.numbers, other.numbers]),
-            torch.cat([self.steps, other.steps]),
-            self.kind,
-            torch.cat([self.file, other.file + len(self.file)]),
+            torch.cat([self.rounding_steps, other.rounding_steps]),
+            self.step_index,
+            torch.cat([self.file_index, other.file_index + len(self.file_index)]),
         )
 
     @property
     def column_steps(self) -> Float64[Tensor, "rows numbers"]:
         """Rounding step of every number; the entries of a rotation depend on the steps of all three angles together."""
-        return (self.steps * torch.tensor([1, 1, 1, 3**0.5]))[:, self.kind]
+        return (self.rounding_steps * torch.tensor([1, 1, 1, 3**0.5]))[:, self.step_index]
 
     @property
     def q(self) -> Float64[Tensor, "rows dof"]:
@@ -166,7 +168,7 @@ def _steps(
     return found
 
 
-def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
+def original_rows(values: RowValues, known_row_count: int = 0) -> Int64[Tensor, " rows"]:
     """Return, for every row, the index of the row of which it is a copy; the row's own index if it is not a copy.
 
     A copy has the joint values and all readings of another row up to the coarser of both roundings. How many rows
@@ -175,17 +177,17 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
 
     Args:
         values: values of all rows.
-        known: if nonzero, only copies of the first `known` rows are searched for.
+        known_row_count: if nonzero, only copies of the first `known_row_count` rows are searched for.
     """
     count = len(values.numbers)
     own = torch.arange(count)
     # known rows rank first, then those with the finest rounding, then those that come first in the file
-    keys = (own.numpy(), *values.steps.T[:3].numpy(), (own >= known).numpy())
+    keys = (own.numpy(), *values.rounding_steps.T[:3].numpy(), (own >= known_row_count).numpy())
     order = torch.from_numpy(np.lexsort(keys))
     rank = order.argsort()
     first, second = _equal_pairs(values)
-    if known:
-        between = (first < known) & (second >= known)
+    if known_row_count:
+        between = (first < known_row_count) & (second >= known_row_count)
         first, second = first[between], second[between]
     swapped = rank[first] > rank[second]
     better, worse = torch.where(swapped, second, first), torch.where(swapped, first, second)
@@ -196,7 +198,7 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     for scope, deviation in ((standing, _STANDING), (~standing, _RETURNING)):
         equal = torch.zeros(count, dtype=torch.bool)
         equal[worse[scope]] = True
-        partners = same_joints.count_partners(rank, known, scope is standing)
+        partners = same_joints.count_partners(rank, known_row_count, scope is standing)
         chance = same_joints.repeat_probability(values, deviation)
         if _are_copies(equal, partners, chance):
             best.scatter_reduce_(0, worse[scope], rank[better[scope]], "amin")
@@ -243,7 +245,7 @@ class _SameJoints:
     def from_values(values: RowValues) -> "_SameJoints":
         coarsest = values.column_steps[:, : values.q.shape[1]].amax(0)
         group = torch.unique((values.q / coarsest).round() + 0.0, dim=0, return_inverse=True)[1]
-        continues = (group[1:] == group[:-1]) & (values.file[1:] == values.file[:-1])
+        continues = (group[1:] == group[:-1]) & (values.file_index[1:] == values.file_index[:-1])
         run = torch.cat([torch.zeros(min(len(group), 1), dtype=torch.int64), (~continues).cumsum(0)])
         return _SameJoints(group, run)
 
@@ -269,11 +271,12 @@ class _SameJoints:
         The rounding is the coarsest one among the rows with the same joint values. Rows without a reading, such as
         rows at sockets, are compared by their joint values.
         """
+        columns = values.rounding_steps.unbind(1)
         steps = torch.stack(
-            [one.scatter_reduce(0, self.group, one, "amax")[self.group] for one in values.steps.unbind(1)], 1
+            [one.scatter_reduce(0, self.group, one, "amax")[self.group] for one in columns], 1
         )
         logarithms = _chance_of_equal(steps, deviation * 2**0.5).log()
-        axes = logarithms[:, values.kind[: values.q.shape[1]]].sum(1)
+        axes = logarithms[:, values.step_index[: values.q.shape[1]]].sum(1)
         length, angle = logarithms[:, 2], logarithms[:, 3]
         lengths, has_rotation = values.length.isfinite().sum(1), values.numbers[:, -1].isfinite()
         read = lengths * length + torch.where(has_rotation, 3 * angle, 0.0)
@@ -342,12 +345,12 @@ def _whole_pairs(rows: MeasuredFields, copied: Bool[Tensor, " rows"]) -> Bool[Te
     return copied & ~(paired & half[pairs])
 
 
-def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Bool[Tensor, " rows"]:
+def copies_of_known(rows: MeasuredFields, robot: Robot, known_rows: RowValues) -> Bool[Tensor, " rows"]:
     """Return the mask of the rows that are copies of known rows, perhaps rounded differently or in another order."""
-    if rows.rows == 0 or not len(known.numbers) or rows.numbers["q"].shape[1] != robot.dof:
+    if rows.rows == 0 or not len(known_rows.numbers) or rows.numbers["q"].shape[1] != robot.dof:
         return torch.zeros(rows.rows, dtype=torch.bool)
-    count = len(known.numbers)
-    values = known + RowValues.from_rows(rows, robot)
+    count = len(known_rows.numbers)
+    values = known_rows + RowValues.from_rows(rows, robot)
     original = original_rows(values, count)[count:]
     return _whole_pairs(rows, original != torch.arange(count, count + rows.rows))
 
@@ -376,9 +379,9 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
     return replace(kept, left_out=(*rows.left_out, *left_out))
 
 
-def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
+def places_text(rows: MeasuredFields, selected: Bool[Tensor, " rows"]) -> str:
     """Return a text that lists files and lines of the chosen rows, at most `MAX_NAMED` of them."""
-    numbers = chosen.nonzero()[:, 0].tolist()
+    numbers = selected.nonzero()[:, 0].tolist()
     named = ", ".join(rows.place_text(number) for number in numbers[:MAX_NAMED])
     return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named
 

@@ -33,13 +33,13 @@ class FileGrowth:
         rows: new rows in the order of the file; None if there are none.
         left_out: new rows that cannot be used, with the reasons.
         notices: sentences about a file that was truncated or replaced.
-        waiting: what is missing: the file, its header, or the end of its last line; "" if nothing is missing.
+        missing_part: what is missing: the file, its header, or the end of its last line; "" if nothing is missing.
     """
 
     rows: Measurements | None = None
     left_out: tuple[UnusableRow, ...] = ()
     notices: tuple[str, ...] = ()
-    waiting: str = ""
+    missing_part: str = ""
 
     @property
     def has_changes(self) -> bool:
@@ -73,40 +73,40 @@ class GrowingFile:
         self._accepted: Counter[str] = Counter()
         self._refused: set[UnusableRow] = set()
 
-    def read(self, final: bool = False) -> FileGrowth:
+    def read(self, is_complete: bool = False) -> FileGrowth:
         """Return the rows that were added to the file since the last call.
 
         Args:
-            final: whether the file is complete, so that the last line is read without a line end.
+            is_complete: whether the file is complete, so that the last line is read without a line end.
 
         Raises:
             MeasurementError: the file cannot be read, its header cannot be used, or the file is missing at the end
-                (`final`).
+                (`is_complete`).
         """
         try:
             state = os.stat(self.path)
         except FileNotFoundError:
-            if final:
+            if is_complete:
                 raise MeasurementError(
                     "there is no such file", at=Place(self._source), remedy="check the path"
                 ) from None
-            return FileGrowth(waiting=f"{self._source} does not exist yet.")
-        stamp = (state.st_ino, state.st_size, state.st_mtime_ns, final)
+            return FileGrowth(missing_part=f"{self._source} does not exist yet.")
+        stamp = (state.st_ino, state.st_size, state.st_mtime_ns, is_complete)
         if stamp == self._stamp:
-            return FileGrowth(waiting=self._waiting)
+            return FileGrowth(missing_part=self._waiting)
         text = read_text(self.path, MeasurementError, "CSV")
-        complete = text if final else text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
+        complete = text if is_complete else text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
         self._stamp, notices = stamp, self._changes(complete)
         self._text = complete
         self._waiting = "" if complete == text else "the last line is not complete yet."
-        if not complete.strip() and not final:
+        if not complete.strip() and not is_complete:
             self._waiting = f"{self._source} has no complete header yet."
-            return FileGrowth(notices=notices, waiting=self._waiting)
+            return FileGrowth(notices=notices, missing_part=self._waiting)
         table = table_of(complete, self._source)
         if not table.records:
             read_header(table, self._robot)
-            return FileGrowth(notices=notices, waiting=self._waiting)
-        data = self._reader(table, final)
+            return FileGrowth(notices=notices, missing_part=self._waiting)
+        data = self._reader(table, is_complete)
         left_out = tuple(one for one in data.left_out if one not in self._refused)
         self._refused.update(left_out)
         new = self._new_rows(data)

@@ -149,7 +149,7 @@ def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot:
         return ()
     rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
     against = robot if model is None else model
-    if implausible := check_rows(rows, against, may_move=MOVES).implausible:
+    if implausible := check_rows(rows, against, allowed_moves=MOVES).implausible_findings:
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import figure_text
-from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_deviation
+from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_scatter
 from pisigma.validation.uncertainty.budget import COVERAGE
 
 _NOT_STATED = "not stated"
@@ -18,7 +18,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     budget, measured, lines = acceptance.budget, acceptance.measured, list[str]()
     if budget.components:
         start = f"With the stated components alone, {_SHARE}" if budget.missing else _SHARE
-        U, k, radius = budget.expanded * 1e3, budget.coverage_factor, budget.radius * 1e3
+        U, k, radius = budget.expanded_uncertainty * 1e3, budget.coverage_factor, budget.coverage_radius * 1e3
         lines.append(
             f"{start} of the positions are expected within {radius:.3f} mm of the commanded ones; the expanded "
             f"uncertainty of a coordinate is U = {U:.3f} mm (k = {k:.2f})."
@@ -39,7 +39,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     if measured is not None and measured.distrust_reason:
         lines.append(measured.distrust_reason)
     if acceptance.contradicted:
-        lines.append(contradiction(acceptance))
+        lines.append(contradiction_sentence(acceptance))
     of_model = [one for one in acceptance.accepted if one.model == acceptance.model]
     lines.append(
         of_model[-1].sentence if of_model else f"Nobody has accepted model '{acceptance.model}' yet."
@@ -47,7 +47,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def contradiction(acceptance: Acceptance) -> str:
+def contradiction_sentence(acceptance: Acceptance) -> str:
     """Return a sentence if the measured errors are larger than the budget explains; "" otherwise."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
@@ -60,7 +60,7 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
     """Return the statements about instrument, robot and temperatures, by name."""
     instrument, span = acceptance.instrument, acceptance.temperature_span
     U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
-    maker, scatter = acceptance.repeatability_mm, pooled_deviation(acceptance.repeats)
+    maker, scatter = acceptance.repeatability_mm, pooled_scatter(acceptance.repeats)
     return (
         ("instrument", instrument.name or _NOT_STATED),
         ("serial number", instrument.serial or _NOT_STATED),
@@ -106,11 +106,11 @@ def budget_table(acceptance: Acceptance) -> Table:
             (
                 "combined",
                 "",
-                figure_text(budget.combined * 1e3),
+                figure_text(budget.combined_uncertainty * 1e3),
                 _freedom(freedom),
                 "root of the sum of squares",
             ),
-            ("expanded", "", figure_text(budget.expanded * 1e3), "", f"k = {k:.3f} for {_SHARE}"),
+            ("expanded", "", figure_text(budget.expanded_uncertainty * 1e3), "", f"k = {k:.3f} for {_SHARE}"),
         ]
     return Table(
         ("component", "type", "standard uncertainty [mm]", "degrees of freedom", "source"), tuple(rows)
@@ -122,7 +122,10 @@ def comparison_table(acceptance: Acceptance) -> Table:
     budget, measured = acceptance.budget, acceptance.measured
     predicted: Sequence[float] = (math.nan,) * 3
     if budget.components:
-        predicted = [1e3 * value for value in (budget.combined, budget.expanded, budget.radius)]
+        predicted = [
+            1e3 * value
+            for value in (budget.combined_uncertainty, budget.expanded_uncertainty, budget.coverage_radius)
+        ]
     found: Sequence[float] = (math.nan,) * 4
     if measured is not None:
         statistics = measured.errors.statistics

@@ -52,15 +52,18 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
         ImportError: the markers need OpenCV, which is not installed.
     """
     wanted = replace(
-        board, square=board.square / board.printed, marker=board.marker / board.printed, printed=1.0
+        board,
+        square=board.square / board.print_scale,
+        marker=board.marker / board.print_scale,
+        print_scale=1.0,
     )
     pattern = board_pattern(wanted)
-    across, down = 1e3 * (pattern.sheet[2:] - pattern.sheet[:2])
+    across, down = 1e3 * (pattern.sheet_rectangle[2:] - pattern.sheet_rectangle[:2])
     paper, (width, height) = _paper(board, float(across), float(down))
     figure = Figure(figsize=(width * MM, height * MM))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
-    corner = np.array([(width - across) / 2, _MARGIN]) - 1e3 * pattern.sheet[:2]
+    corner = np.array([(width - across) / 2, _MARGIN]) - 1e3 * pattern.sheet_rectangle[:2]
     axes.add_patch(PathPatch(_outline(pattern, corner), facecolor="black", edgecolor="none"))
     top = _MARGIN + down + 4
     start, end = (width - RULER) / 2, (width + RULER) / 2
@@ -92,7 +95,7 @@ def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, 
 
 def _outline(pattern: Pattern, corner: np.ndarray) -> Outline:
     """Return one outline of all black rectangles [mm], without gaps between them."""
-    left, top, right, bottom = (1e3 * pattern.black + np.tile(corner, 2)).T
+    left, top, right, bottom = (1e3 * pattern.black_rectangles + np.tile(corner, 2)).T
     ends = np.stack([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]).transpose(
         2, 0, 1
     )

@@ -54,7 +54,7 @@ def draw_residuals(
     panels = figure.subplots(count, 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, shown, strict=False):
         _draw_over_rows(axes, name, residuals[name], calibration)
-    set_margins(figure, left=0.8, right=0.05, bottom=0.5, top=0.35, up=0.85)
+    set_margins(figure, left=0.8, right=0.05, bottom=0.5, top=0.35, row_spacing=0.85)
     save_figure(figure, path)
 
 
@@ -118,7 +118,7 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
     figure = Figure(figsize=(width, side + 0.3))
     grid = figure.subplots(1, len(tables), squeeze=False)[0]
     room = 0.15 + _LETTER * max(len(name) for table in tables for name in table.names)
-    set_margins(figure, left=room, right=1.15, bottom=room + 0.35, top=0.35, across=room + 0.1)
+    set_margins(figure, left=room, right=1.15, bottom=room + 0.35, top=0.35, column_spacing=room + 0.1)
     for axes, table, title in zip(grid, tables, ("lengths", "angles"), strict=True):
         shown = show_correlations(axes, table.names, table.values)
         axes.set_title(title, fontsize=11)
@@ -163,7 +163,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     rows = (len(joints) + 1) // 2
     figure = Figure(figsize=(10.0, 2.3 * rows + 0.5))
     panels = figure.subplots(rows, 2, squeeze=False).flatten()
-    set_margins(figure, left=0.7, right=0.05, bottom=0.7, top=0.25, across=0.75, up=0.7)
+    set_margins(figure, left=0.7, right=0.05, bottom=0.7, top=0.25, column_spacing=0.75, row_spacing=0.7)
     with torch.no_grad():
         corrections = correction.for_rows(measurements).numpy()
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):

@@ -155,7 +155,7 @@ def calibration_text(
     summary: CalibrationSummary,
     folder: Path | None,
     seconds: float,
-    also: Sequence[Block] = (),
+    first_blocks: Sequence[Block] = (),
 ) -> ResultText:
     """Lay out a calibration: the verdict, warnings, and errors of held-out rows; on demand all tables and parameters.
 
@@ -163,7 +163,7 @@ def calibration_text(
         summary: figures of the calibration.
         folder: folder to which the model was written; None if it was not written.
         seconds: duration of the calibration [s].
-        also: blocks that are shown first.
+        first_blocks: blocks that are shown first.
     """
     warnings = [*tables.implausible_lines(summary)[1:], *tables.warning_lines(summary)]
     found = [one.sentence for one in summary.diagnostics if one.kind == "scale"]
@@ -178,7 +178,7 @@ def calibration_text(
     return ResultText(
         calibration_verdict(summary, folder, len(warnings)),
         tuple(warnings),
-        (*also, *_accuracy_blocks(summary), sentences("scale of the sensor", remarks)),
+        (*first_blocks, *_accuracy_blocks(summary), sentences("scale of the sensor", remarks)),
         (*_learned(summary), *_fit(summary), *_parameters(summary)),
         () if folder is None else (written,),
     )

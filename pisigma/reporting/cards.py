@@ -83,7 +83,7 @@ def _draw_calibration(
         lengths = {name: errors.position.numpy() for name, errors in validation.all_errors.items()}
         figures.draw_held_out(lengths, folder / model_files.HELD_OUT_PNG)
         spread = validation.predicted_spread
-        if spread is not None and spread.values:
+        if spread is not None and spread.value_count:
             figures.draw_spread(spread, folder / model_files.SPREAD_PNG)
     if isinstance(result, HybridResult) and result.learned is not None:
         figures.draw_corrections(result.learned.correction, rows, folder / model_files.CORRECTIONS_PNG)

@@ -97,7 +97,13 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def set_margins(
-    figure: Figure, left: float, right: float, bottom: float, top: float, across: float = 0.0, up: float = 0.0
+    figure: Figure,
+    left: float,
+    right: float,
+    bottom: float,
+    top: float,
+    column_spacing: float = 0.0,
+    row_spacing: float = 0.0,
 ) -> None:
     """Set margins around and between axes [inch]; measuring all texts instead would double the drawing time.
 
@@ -107,15 +113,20 @@ def set_margins(
         right: margin right of the last column.
         bottom: margin below the last row.
         top: margin above the first row.
-        across: space between two columns.
-        up: space between two rows.
+        column_spacing: space between two columns.
+        row_spacing: space between two rows.
     """
     width, height = figure.get_size_inches()
     grid = figure.axes[0].get_gridspec()
     assert grid is not None, "only figures of subplots have margins"
     rows, columns = grid.get_geometry()
-    panel = (width - left - right - (columns - 1) * across) / columns
-    storey = (height - bottom - top - (rows - 1) * up) / rows
+    panel = (width - left - right - (columns - 1) * column_spacing) / columns
+    storey = (height - bottom - top - (rows - 1) * row_spacing) / rows
     figure.subplots_adjust(
-        left / width, bottom / height, 1 - right / width, 1 - top / height, across / panel, up / storey
+        left / width,
+        bottom / height,
+        1 - right / width,
+        1 - top / height,
+        column_spacing / panel,
+        row_spacing / storey,
     )

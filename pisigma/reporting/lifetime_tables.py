@@ -37,14 +37,14 @@ def _chart_row(chart: Chart) -> tuple[str, ...]:
 _NO_VALUE = "-"
 
 
-def difference_table(differences: ParameterDifferences, names: tuple[str, str]) -> Table:
+def difference_table(differences: ParameterDifferences, model_names: tuple[str, str]) -> Table:
     """Return a table of DH parameters that differ between two models: values, shift with 95 % interval, and p.
 
     Args:
         differences: differences of the models.
-        names: names of the models.
+        model_names: names of the models.
     """
-    columns = ("parameter", "unit", *names, "shift alone", "± 95 %", "p")
+    columns = ("parameter", "unit", *model_names, "shift alone", "± 95 %", "p")
     shown = [one for one in differences.parameters if one.difference or any(one.sigmas)]
     return Table(columns, tuple(_difference_row(one) for one in shown))
 

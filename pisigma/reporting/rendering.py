@@ -45,7 +45,7 @@ def write_card(folder: Path, template: str, **content: object) -> None:
     (folder / CARD).write_text(render(template, **content) + "\n", encoding="utf-8")
 
 
-def code(line: str) -> Markup:
+def markup_with_code(line: str) -> Markup:
     """Escape a sentence for a page, and show its commands, which are in backquotes, as code."""
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))
 
@@ -73,7 +73,7 @@ def _environment() -> jinja2.Environment:
         {
             "figure": figure_text,
             "digits": "{:.4g}".format,
-            "code": code,
+            "code": markup_with_code,
             "column_classes": column_classes,
             "pose_table": pose_table,
             "joint_table": joint_table,

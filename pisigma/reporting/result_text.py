@@ -34,28 +34,28 @@ class Block:
     """Sentences or a table that are shown together or not at all.
 
     Attributes:
-        what: short name of the block.
+        name: short name of the block.
         sentences: sentences; the one before a table is its title.
         columns: headings of the table; () without a table.
         rows: cells of the table.
         indent: indentation of the further lines of a sentence on a screen.
     """
 
-    what: str
+    name: str
     sentences: tuple[str, ...]
     columns: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     indent: str = ""
 
 
-def table_block(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], what: str = "") -> Block:
-    """Return a table with its title; `what` is its short name."""
-    return Block(what or title, (title,), tuple(columns), tuple(map(tuple, rows)))
+def table_block(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], name: str = "") -> Block:
+    """Return a table with its title; `name` is its short name."""
+    return Block(name or title, (title,), tuple(columns), tuple(map(tuple, rows)))
 
 
-def sentences(what: str, lines: Iterable[str], indent: str = "") -> Block:
+def sentences(name: str, lines: Iterable[str], indent: str = "") -> Block:
     """Return sentences as a block."""
-    return Block(what, tuple(lines), indent=indent)
+    return Block(name, tuple(lines), indent=indent)
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ class ResultText:
         warnings: warnings as sentences; all are shown.
         blocks: blocks, most important first.
         details: blocks that are shown on demand.
-        closing: sentence on the written files.
+        closing_sentences: sentence on the written files.
     """
 
     verdict: Verdict
     warnings: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
     details: tuple[Block, ...] = ()
-    closing: tuple[str, ...] = ()
+    closing_sentences: tuple[str, ...] = ()
 
 
 def merge_alike_warnings(warnings: Iterable[str]) -> list[str]:

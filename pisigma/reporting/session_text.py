@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
-def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText:
+def session_text(state: SessionState, closing_sentences: Sequence[str] = ()) -> ResultText:
     """Lay out a session: the accuracy so far, the used rows, and whether to measure more.
 
     Args:
         state: state of the session.
-        closing: sentence on the written files.
+        closing_sentences: sentence on the written files.
     """
     counting = int((~state.rows.alarmed).sum())
     reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
@@ -35,7 +35,7 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
     verdict = Verdict(
         reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
     )
-    return ResultText(verdict, tuple(_narrow(state)), closing=tuple(closing))
+    return ResultText(verdict, tuple(_narrow(state)), closing_sentences=tuple(closing_sentences))
 
 
 def _narrow(state: SessionState) -> list[str]:
@@ -64,8 +64,8 @@ _SHOWN_ROWS, _SHOWN_ALARMS, _SHOWN_POINTS = 8, 4, 8
 def step_lines(step: SessionStep) -> Iterator[str]:
     """Return lines about new rows, alarms and poses; many rows or alarms of one kind share a line."""
     yield from step.growth.notices
-    if step.growth.waiting and not step.state.rows.line:
-        yield f"Waiting: {step.growth.waiting}"
+    if step.growth.missing_part and not step.state.rows.line:
+        yield f"Waiting: {step.growth.missing_part}"
     state = step.state
     lines = [] if step.growth.rows is None else step.growth.rows.line
     alarms = {alarm.line for alarm in step.alarms if not alarm.counts}
@@ -133,7 +133,7 @@ def session_page(step: SessionStep | None, state: SessionState, title: str) -> "
     first = max(0, len(state.rows.line) - _SHOWN_ROWS)
     rows = [(str(state.rows.line[row]), _verdict(state, row)) for row in range(first, len(state.rows.line))]
     points = (*state.reached_accuracy, *state.expected_accuracy)[-_SHOWN_POINTS:]
-    waiting = "" if step is None else step.growth.waiting
+    waiting = "" if step is None else step.growth.missing_part
     alarms = [make_printable(alarm.sentence, cut=False) for alarm in state.alarms[-_SHOWN_ALARMS:]]
     colour = {"measure": "bold", "repeat": "bold red", "correct": "bold red", "stop": "bold green"}[
         state.advice.action

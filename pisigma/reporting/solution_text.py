@@ -109,7 +109,7 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
     return records
 
 
-def failure(solution: Solution, places: Sequence[str], one_suffices: bool) -> str | None:
+def failure_sentence(solution: Solution, places: Sequence[str], one_suffices: bool) -> str | None:
     """Return a sentence about poses that the robot cannot reach as requested; None if it reaches all.
 
     Args:

@@ -58,9 +58,9 @@ def uncapitalised(sentence: str) -> str:
     return sentence if sentence[1:2].isupper() else f"{sentence[:1].lower()}{sentence[1:]}"
 
 
-def count_text(count: int, what: str) -> str:
+def count_text(count: int, noun: str) -> str:
     """Return a number with a noun, such as "1 warning" or "2 warnings"."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def rms_text(errors: "ErrorFigures", rows: int) -> str:

@@ -17,7 +17,7 @@ from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
 from pisigma.validation.checks.row_order import instrument_moved_error
-from pisigma.validation.checks.setup_fault import check_position_size, joint_columns, setup_diagnostics
+from pisigma.validation.checks.setup_fault import check_joint_columns, check_position_size, setup_diagnostics
 from pisigma.validation.checks.unexplained import check_residual
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
@@ -35,34 +35,34 @@ class RowVerdict:
         diagnostics: the findings; those that make the rows implausible come first.
         judged: the rows with the predictions of the model; None if rows were compared with a nominal robot, or if
             too few have positions.
-        faults_of_lengths: setup faults that explain the errors of rows without positions.
+        length_faults: setup faults that explain the errors of rows without positions.
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
     judged: RowsUnderModel | None = None
-    faults_of_lengths: tuple[SetupFault, ...] = ()
+    length_faults: tuple[SetupFault, ...] = ()
 
     @property
     def setup_faults(self) -> tuple[SetupFault, ...]:
         """Setup faults of any size that explain the errors of all rows, including allowed motions."""
-        return self.faults_of_lengths if self.judged is None else self.judged.setup_faults
+        return self.length_faults if self.judged is None else self.judged.setup_faults
 
     @property
-    def implausible(self) -> tuple[Diagnostic, ...]:
+    def implausible_findings(self) -> tuple[Diagnostic, ...]:
         """Findings that forbid the use of the rows; commands exit with status 3."""
         return tuple(one for one in self.diagnostics if one.severity == "implausible")
 
     @property
     def trusted(self) -> bool:
         """Whether the rows may be used."""
-        return not self.implausible
+        return not self.implausible_findings
 
 
 def check_rows(
     rows: Measurements,
     reference: Robot | CalibratedModel,
     fitted: Collection[FrameKind] = (),
-    may_move: Collection[Move] = (),
+    allowed_moves: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
     """Check rows before they are used, against a model or a nominal robot.
@@ -76,7 +76,7 @@ def check_rows(
         rows: the rows.
         reference: a calibrated model, or the nominal robot.
         fitted: frames and tools that are known to have moved since the model was made.
-        may_move: what else may have moved since then without this being a fault of the rows.
+        allowed_moves: what else may have moved since then without this being a fault of the rows.
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
 
     Raises:
@@ -91,20 +91,20 @@ def check_rows(
         reference = reference.nominal
     if isinstance(reference, Robot):
         return RowVerdict(_until_implausible(_against_robot(rows, reference)))
-    return check_rows_by_model(rows, reference, fitted, may_move, nominal)
+    return check_rows_by_model(rows, reference, fitted, allowed_moves, nominal)
 
 
 def check_rows_by_model(
     rows: Measurements,
     model: CalibratedModel,
     fitted: Collection[FrameKind] = (),
-    may_move: Collection[Move] = (),
+    allowed_moves: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
     """Run the checks of `ROW_CHECKS`, or `diagnose_lengths` for rows without positions; see `check_rows`."""
-    judged = RowsUnderModel.from_rows(model, rows, fitted, may_move, nominal)
+    judged = RowsUnderModel.from_rows(model, rows, fitted, allowed_moves, nominal)
     if judged is None and rows.position is None:
-        diagnostics, faults = diagnose_lengths(model, rows, fitted, may_move)
+        diagnostics, faults = diagnose_lengths(model, rows, fitted, allowed_moves)
         return RowVerdict(diagnostics, None, faults)
     if judged is None:
         return RowVerdict()
@@ -162,7 +162,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
     yield _moved_setup(rows, robot)
     yield setup_diagnostics(robot, rows)
     yield check_position_size(robot, rows)
-    yield joint_columns(robot, rows)
+    yield check_joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
     if rows.rows >= _MIN_ROWS_TO_CALIBRATE:
         yield _as_calibrated(rows, robot)

@@ -24,8 +24,8 @@ from pisigma.workbench.viewing.session_view import (
     FIELD,
     MAGNIFICATIONS,
     arrow_magnification,
+    color_scale_maximum,
     first_view,
-    top_of_scale,
 )
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.measure import MeasuringSession
@@ -195,7 +195,7 @@ class CellScene:
         """Show rows, and their errors if the rows have been compared with each other."""
         with self._lock, self._server.atomic():
             self._rows, self._marked = rows, []
-            times = arrow_magnification(top_of_scale(rows), self._reach)
+            times = arrow_magnification(color_scale_maximum(rows), self._reach)
             self._slider.value = times  # type: ignore[misc]  # a decorated setter
             self._draw_rows()
         self._server.flush()
@@ -221,7 +221,7 @@ class CellScene:
         if self._scene is None or self._rows is None:
             return None
         rows = replace(self._rows, alarmed=self._rows.alarmed | np.isin(self._rows.line, self._marked))
-        position = self._scene.show_rows(rows, top_of_scale(rows), float(self._slider.value))
+        position = self._scene.show_rows(rows, color_scale_maximum(rows), float(self._slider.value))
         marked = np.flatnonzero(np.isin(rows.line, self._marked))
         return position[marked[0]] if marked.size else None
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pisigma.files.errors import PlanningError
-from pisigma.files.setting import Setting, attributes_of, flat_settings
-from pisigma.files.yaml_file import Section, plain_content
-from pisigma.files.yaml_writing import with_value
+from pisigma.files.setting import Setting, attribute_descriptions, flat_settings
+from pisigma.files.yaml_file import Section, parse_plain_yaml
+from pisigma.files.yaml_writing import with_changed_value
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.workflow.cell.cell_file import CAMERA_KEYS, STATED_ABOVE, STEPS, CellDocument, CellFile
@@ -47,7 +47,7 @@ class Field:
         default: value without an entry: the value in `cell.yaml`, otherwise the default; "" without a default.
         value: value that the form shows as entered.
         option: option of the command, or its start if a value follows without a space; "" without a command.
-        first: whether the field is shown at once, and not only behind "all settings".
+        shown_at_once: whether the field is shown at once, and not only behind "all settings".
     """
 
     key: str
@@ -58,7 +58,7 @@ class Field:
     default: str = ""
     value: str = ""
     option: str = ""
-    first: bool = True
+    shown_at_once: bool = True
 
     @property
     def label(self) -> str:
@@ -79,14 +79,16 @@ def form_of(step: str, file: CellFile) -> list[Field]:
         if one.option.is_key or one.default is False:  # there is no option that switches these settings off
             option = f"--set {key}="
         default = _text(stated.get(key, one.default))
-        fields.append(replace(_field(one), default=default, option=option, first=key in FIRST.get(step, ())))
+        fields.append(
+            replace(_field(one), default=default, option=option, shown_at_once=key in FIRST.get(step, ()))
+        )
     return fields
 
 
 def form_of_cell(file: CellFile) -> dict[str, list[Field]]:
     """Return the fields of `cell.yaml` by section, with the values that the file states; "" is the cell itself."""
     text = file.path.read_text(encoding="utf-8")
-    stated = plain_content(text, PlanningError, str(file.path))
+    stated = parse_plain_yaml(text, PlanningError, str(file.path))
     fields: dict[str, list[Field]] = {"": []}
     for one in _section(CellDocument, stated, ""):
         fields.setdefault(one.key.rpartition(".")[0] and one.key.partition(".")[0], []).append(one)
@@ -120,7 +122,7 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
     stated = [(one, value) for one, value in changed if value]
     for one, value in [*stated, *reversed(removed)]:  # a removed item changes the numbers of later items
         keys = [int(part) if part.isdigit() else part for part in one.key.split(".")]
-        text = with_value(text, keys, _value(one.kind, value), str(file.path))
+        text = with_changed_value(text, keys, _value(one.kind, value), str(file.path))
     return text
 
 
@@ -136,7 +138,9 @@ def digest_of(text: str) -> str:
 
 def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field]:
     """Yield the fields of a section of `cell.yaml` and its sections; lists of sections get an empty section."""
-    meanings = {key: text for one in reversed(section.__mro__) for key, text in attributes_of(one).items()}
+    meanings = {
+        key: text for one in reversed(section.__mro__) for key, text in attribute_descriptions(one).items()
+    }
     for name, info in section.model_fields.items():
         key, kind, bounds = f"{prefix}{info.alias or name}", info.annotation, list(info.metadata)
         value = stated.get(name) if isinstance(stated, dict) else None

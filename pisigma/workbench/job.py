@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from pisigma.files.errors import missing_extra, system_fault
+from pisigma.files.errors import missing_extra, system_problem_text
 from pisigma.files.progress import Progress, TimeLeft
 from pisigma.reporting.result_text import ResultText
 
@@ -31,12 +31,12 @@ class Outcome:
         rows: wrong rows (file and line), by the sentences of the findings that name them.
         field: field of the form that causes the refusal; "" if no field does.
         subject: object of the step, such as a session; "" if the step implies it.
-        curve: expected accuracy by number of poses; () without a curve.
+        accuracy_curve: expected accuracy by number of poses; () without a curve.
         stopped: whether a person stopped it.
         step: name of the step.
         command: command line that has the same effect.
         person: who started the step.
-        ended: day and time at which the step ended.
+        end_time: day and time at which the step ended.
     """
 
     text: ResultText | None = None
@@ -44,12 +44,12 @@ class Outcome:
     rows: Mapping[str, str] = field(default_factory=dict)
     field: str = ""
     subject: str = ""
-    curve: tuple[Any, ...] = ()
+    accuracy_curve: tuple[Any, ...] = ()
     stopped: bool = False
     step: str = ""
     command: str = ""
     person: str = ""
-    ended: str = ""
+    end_time: str = ""
 
 
 Work = Callable[[Progress], Outcome]
@@ -63,19 +63,19 @@ class Job:
         step: name of the step.
         person: who started the step.
         command: command line that has the same effect.
-        what: the current activity, with the time left.
+        activity: the current activity, with the time left.
         stopped_by: name of the person who asked to stop the step; "" if nobody did.
     """
 
     step: str
     person: str
     command: str
-    what: str = ""
+    activity: str = ""
     stopped_by: str = ""
     started: str = field(default_factory=lambda: _clock())
     time_left: TimeLeft = field(default_factory=TimeLeft)
 
-    def progress(self, what: str) -> None:
+    def progress(self, message: str) -> None:
         """Record the current activity, or end the step if a person stopped it.
 
         Raises:
@@ -83,7 +83,7 @@ class Job:
         """
         if self.stopped_by:
             raise StoppedError
-        self.what = self.time_left.after(what)
+        self.activity = self.time_left.after(message)
 
 
 class Jobs:
@@ -121,15 +121,15 @@ class Jobs:
         with self._lock:
             return self.running, self.version, self.ended
 
-    def stop(self, person: str, number: str) -> None:
+    def stop(self, person: str, ended_steps: str) -> None:
         """Stop the running step when it next reports progress; no incomplete files are left.
 
         Args:
             person: who stops the step.
-            number: number of steps that had ended when the person decided; a step that started later is not stopped.
+            ended_steps: number of steps that had ended when the person decided; a later step is not stopped.
         """
         with self._lock:
-            if self.running is not None and number == str(self.ended):
+            if self.running is not None and ended_steps == str(self.ended):
                 self.running.stopped_by = person
                 self.version += 1
 
@@ -151,7 +151,7 @@ class Jobs:
         except ImportError as problem:
             found = Outcome(refusal=str(missing_extra(problem) or problem))
         except Exception as problem:
-            if not (fault := system_fault(problem)):
+            if not (fault := system_problem_text(problem)):
                 traceback.print_exc(file=sys.stderr)
             found = Outcome(
                 refusal=fault
@@ -160,7 +160,7 @@ class Jobs:
             )
         with self._lock:
             self.outcomes[job.step] = replace(
-                found, step=job.step, command=job.command, person=job.person, ended=_clock()
+                found, step=job.step, command=job.command, person=job.person, end_time=_clock()
             )
             self.running = None
             self.version, self.ended = self.version + 1, self.ended + 1

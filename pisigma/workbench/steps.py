@@ -79,38 +79,44 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     )
 
 
-def write_cell(folder: Path, form: Form, texts: dict[str, str]) -> None:
+def write_cell(folder: Path, form: Form, earlier_texts: dict[str, str]) -> None:
     """Write `cell.yaml` if the new text is valid and the file has not changed since the person saw it.
 
     Args:
         folder: folder of the cell, whose file need not be valid.
         form: "seen", the digest of the file that the person saw, with its new "text" or the values of its form; or
             "undo", the digest of the file whose last change is undone.
-        texts: the text before every change, by the digest of the text after it.
+        earlier_texts: the text before every change, by the digest of the text after it.
 
     Raises:
         PlanningError: the file has been changed in the meantime, or the new text is not valid.
     """
     before = text_of(folder)
     digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
-    if digest not in (form.get("seen"), undo) or (undo and undo not in texts):
+    if digest not in (form.get("seen"), undo) or (undo and undo not in earlier_texts):
         raise PlanningError(
             "the file has been changed since it was shown here",
             at=Place(folder / CELL_FILE),
             remedy="copy what you entered, discard your changes, and repeat them",
         )
-    text = texts[undo] if undo else changed_cell(CellFile.read(folder), form) if entered is None else entered
+    text = (
+        earlier_texts[undo]
+        if undo
+        else changed_cell(CellFile.read(folder), form)
+        if entered is None
+        else entered
+    )
     CellFile.write(folder, text)
     if undo:
-        del texts[undo]
+        del earlier_texts[undo]
     elif text != before:
-        texts[digest_of(text)] = before
+        earlier_texts[digest_of(text)] = before
 
 
 def plan(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Plan poses, and store the plan in the cell."""
     planned, path = cell.plan(progress, **changed_settings("plan", form))
-    return Outcome(plan_text(planned, [path]), curve=planned.curve)
+    return Outcome(plan_text(planned, [path]), accuracy_curve=planned.accuracy_curve)
 
 
 def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
@@ -124,7 +130,7 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     return Outcome(
         _in_cell(text, cell),
         _NOT_STORED if entry is None else "",
-        rows=rows_at_fault(found.summary.diagnostics),
+        rows=wrong_rows_by_sentence(found.summary.diagnostics),
     )
 
 
@@ -134,12 +140,12 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
     found, entry = cell.verify(None, form.get("of_model") or None, **changed_settings("verify", form))
     in_use = cell.history.in_use
     used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
-    text = replace(verification_text(found, _WIDTH), closing=tuple(used))
+    text = replace(verification_text(found, _WIDTH), closing_sentences=tuple(used))
     refusal = "" if found.accepted else found.sentence
-    return Outcome(_in_cell(text, cell), refusal, rows=rows_at_fault(found.diagnostics))
+    return Outcome(_in_cell(text, cell), refusal, rows=wrong_rows_by_sentence(found.diagnostics))
 
 
-def rows_at_fault(findings: Sequence[Diagnostic]) -> dict[str, str]:
+def wrong_rows_by_sentence(findings: Sequence[Diagnostic]) -> dict[str, str]:
     """Return the wrong rows by the sentences of the findings."""
     return {one.sentence: "; ".join(one.rows) for one in findings if one.rows}
 
@@ -196,7 +202,7 @@ def incoming_rows(files: list[Path], cell: Cell, form: Form) -> IncomingRows:
 
 def import_session(incoming: IncomingRows, form: Form) -> Outcome:
     """Add uploaded rows to the cell as a session."""
-    said = () if incoming.imported is None else incoming.imported.sentences
+    said = () if incoming.imported_rows is None else incoming.imported_rows.sentences
     entry = incoming.add(form.get("accept_implausible") == "true", form.get("date", "").strip())
     remarks = tuple(filter(None, (*said, entry.remark)))
     trust = (
@@ -229,7 +235,7 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     path = cell.sessions.checked_path(sessions[name])
     growing: GrowingFile = growing_file(path, session.plan.arm.robot, session.plan.settings)
     progress("checking the rows against each other")
-    growth = growing.read(final=True)
+    growth = growing.read(is_complete=True)
     session.add(growth.rows, growth.left_out)
     session.update(progress)
     return _session_outcome(session.state, f"Session {name}"), session.state
@@ -298,7 +304,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
         table_block("Poses that were left unchanged", ("line", "reason"), alone),
     )
     text = ResultText(
-        verdict, exported.warnings, tuple(one for one in blocks if one.rows or one.what == "remarks")
+        verdict, exported.warnings, tuple(one for one in blocks if one.rows or one.name == "remarks")
     )
     return Outcome(text, exported.failure or exported.missed_limit or "")
 

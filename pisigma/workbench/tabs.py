@@ -17,7 +17,7 @@ from pisigma.lifetime.cell.layout import EXPORTS, MODELS, PLANS, REPORTS
 from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.planning.plan_file import joint_columns, yaml_of
-from pisigma.reporting.rendering import code
+from pisigma.reporting.rendering import markup_with_code
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -108,7 +108,7 @@ class Tabs:
                 "lines": line_numbers_in,
                 "name": lambda path: Path(path).name,
                 "tab_of": lambda step: _TAB_OF.get(step, step),
-                "code": code,
+                "code": markup_with_code,
                 "ticks": ticks,
             },
         )
@@ -143,14 +143,14 @@ class Tabs:
             fault=fault, text=text, seen=digest_of(text), outcomes=self._jobs.outcomes
         )
 
-    def tab(self, name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> str:
+    def tab(self, name: str, cell: Cell, status: CellStatus, earlier_texts: Mapping[str, str]) -> str:
         """Render the content of a tab.
 
         Args:
             name: name of the tab.
             cell: the cell.
             status: status of the cell.
-            texts: the text of `cell.yaml` before a change of the page, by the digest of the text after it.
+            earlier_texts: the text of `cell.yaml` before a change of the page, by the digest of the text after it.
         """
         context: dict[str, Any] = {
             "facts": status.facts,
@@ -164,7 +164,7 @@ class Tabs:
             "words": form_of_command(status.step.command) if status.step.command else None,
         }
         return self._environment.get_template(f"{name}.html.j2").render(
-            context | _more(name, cell, status, texts)
+            context | _more(name, cell, status, earlier_texts)
         )
 
     def proposal(self, incoming: IncomingRows, numbers: str) -> str:
@@ -244,7 +244,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
         case "measure":
             return {"columns": [*joint_columns(cell.robot), *(f"{one}_mm" for one in POSITION)]}
         case "calibrate":
-            return {"figures": figures(cell, status)}
+            return {"figures": newest_model_figures(cell, status)}
         case "verify":
             return {"charts": [one for one in _names(cell.folder / REPORTS) if one.endswith(CHARTS)][:1]}
         case "deliver":
@@ -284,7 +284,7 @@ def timeline(status: CellStatus) -> list[TimelineEntry]:
     return sorted(entries, key=lambda one: one.day, reverse=True)
 
 
-def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
+def newest_model_figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
     """Return the newest model and the names of its figures."""
     models = status.facts.models
     if not models:

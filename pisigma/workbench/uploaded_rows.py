@@ -83,7 +83,7 @@ class UploadedRows:
             cell = Cell.open(self.folder)
             for session in cell.history.sessions():
                 if f"{session.name}.csv" in text:
-                    rows = cell.sessions.as_measured(session)
+                    rows = cell.sessions.rows_of_file(session)
                     self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
                     break
             self._scene.mark_lines(line_numbers_in(text))

@@ -186,7 +186,7 @@ class Workbench(UploadedRows):
         running = job and {
             "step": job.step,
             "person": job.person,
-            "what": job.what,
+            "what": job.activity,
             "started": job.started,
             "stopped_by": job.stopped_by,
         }

@@ -40,7 +40,7 @@ from pisigma.validation.held_out.calibration_validation import (
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.few_rows import fit_with_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
-from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
+from pisigma.validation.held_out.pose_statistics import predicted_rms_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,
@@ -69,10 +69,10 @@ class Calibration(AbstractModelResult):
         test: errors of the rows of the set "test"; None if there are none.
         held_out: all held-out rows with their errors, as in the model folder; None if there was no validation.
         summary: all figures.
-        texts: description of the model, and limits of its validation.
+        card_texts: description of the model, and limits of its validation.
         settings: settings of the calibration; None for a recipe.
         seconds: computing time [s].
-        figures: whether the card has figures.
+        has_figures: whether the card has figures.
     """
 
     model: CalibratedModel
@@ -82,10 +82,10 @@ class Calibration(AbstractModelResult):
     test: CalibrationValidation | None
     held_out: HeldOutRows | None
     summary: CalibrationSummary
-    texts: CardTexts
+    card_texts: CardTexts
     settings: CalibrationSettings | None = None
     seconds: float = 0.0
-    figures: bool = True
+    has_figures: bool = True
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -104,7 +104,7 @@ class Calibration(AbstractModelResult):
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
         judged = self.validation or self.test
         write_calibration_card(
-            model, self.result, self.rows, judged, summary, self.texts, folder, self.figures
+            model, self.result, self.rows, judged, summary, self.card_texts, folder, self.has_figures
         )
         if self.held_out is not None:
             text = self.held_out.to_csv(model.robot)
@@ -221,13 +221,13 @@ def compose_calibration(
         warnings=summary.warnings + warnings,
     )
     if validation is None and summary.test is None and summary.held_out is None:
-        predicted = predicted_at_other_poses(result, rows)
+        predicted = predicted_rms_at_other_poses(result, rows)
         summary = summary.with_figures(predicted_rms_mm=None if predicted is None else predicted * 1e3)
     kept = (
         None if validation is None or held_out is None else HeldOutRows.from_validation(validation, held_out)
     )
     if kept is not None:
-        summary = summary.with_figures(held_out_rows=kept.hashes(kept.to_csv(nominal)))
+        summary = summary.with_figures(held_out_rows=kept.compute_hashes(kept.to_csv(nominal)))
     model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)
     if isinstance(result, HybridResult):
         model = with_hybrid(model, result, rows)

@@ -207,7 +207,8 @@ def compare(
         warnings += right.warnings
         compared = compare_models(models, right.rows, settings.bootstrap, fitted)
         found = [
-            check_rows(right.rows, model, fitted, {"joint_zero"}).implausible for model in loaded.values()
+            check_rows(right.rows, model, fitted, {"joint_zero"}).implausible_findings
+            for model in loaded.values()
         ]
         diagnostics = (
             found[0] if all(found) else ()

@@ -213,7 +213,7 @@ def _summary(
             held_out=len(poses.T),
             beyond_measured_share=float((poses.status == Status.OUTSIDE_DOMAIN).double().mean()),
             inside_domain_share=float(model.domain.contains(scaled).double().mean()),
-            drawn=poses.drawn,
+            drawn=poses.drawn_count,
             refused=poses.refused,
         ),
         sizes=sizes,

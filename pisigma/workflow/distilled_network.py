@@ -93,7 +93,7 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
 def choose_network(
     parent: CalibratedModel,
     poses: SolvedPoses,
-    chosen: tuple[slice, slice],
+    fit_and_selection: tuple[slice, slice],
     sizes: tuple[NetworkSize, ...],
     seed: int,
     max_iterations: int,
@@ -104,18 +104,18 @@ def choose_network(
     Args:
         parent: the model that is distilled.
         poses: poses with the full solutions of the model.
-        chosen: slices of the poses to fit and of the poses for model selection.
+        fit_and_selection: slices of the poses to fit and of the poses for model selection.
         sizes: sizes to fit, in ascending order.
         seed: random seed.
         max_iterations: maximum number of iterations per joint.
         progress: called with the current step.
     """
-    pairs = _pairs(poses, chosen[0])
+    pairs = _pairs(poses, fit_and_selection[0])
     fits: list[tuple[CorrectionNetwork, NetworkSize, float]] = []
     for size in sizes:
         of_size = with_stage(progress, f"orders {size.orders}, harmonics {size.harmonics}")
         network = _fit_size(parent.robot, size, pairs, seed, max_iterations, of_size)
-        T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
+        T, q = poses.T[fit_and_selection[1]], poses.q_nominal[fit_and_selection[1]]
         with torch.no_grad():
             reached = parent.forward(q + network(T, q))
         error = float((reached[:, :3, 3] - T[:, :3, 3]).square().sum(-1).mean().sqrt())

@@ -58,8 +58,8 @@ class Evaluation:
         rows: number of evaluated rows.
         settings: settings of the evaluation.
         comparison: figures of every model, with confidence intervals and differences from the first model.
-        evaluated: the models, without the references, by their names in the comparison.
-        missed: limits that are missed, as clauses without a full stop.
+        evaluated_models: the models, without the references, by their names in the comparison.
+        missed_limits: limits that are missed, as clauses without a full stop.
         diagnostics: reasons why errors of a model are too large for a calibrated robot; empty if they are plausible.
         warnings: sentences with other remarks.
         seconds: computing time [s].
@@ -69,8 +69,8 @@ class Evaluation:
     rows: int
     settings: EvaluationSettings
     comparison: ModelComparison
-    evaluated: Mapping[str, EvaluatedModel]
-    missed: tuple[str, ...]
+    evaluated_models: Mapping[str, EvaluatedModel]
+    missed_limits: tuple[str, ...]
     diagnostics: tuple[Diagnostic, ...]
     warnings: tuple[str, ...]
     seconds: float
@@ -83,13 +83,14 @@ class Evaluation:
     @property
     def accepted(self) -> bool:
         """Whether every model meets every limit, and no errors are implausible."""
-        return not self.missed and not self.diagnostics
+        return not self.missed_limits and not self.diagnostics
 
     def to_json(self) -> dict[str, object]:
         """Return all results as plain values: the result of `pisigma evaluate --json`."""
         comparison = self.comparison.to_json()
         comparison["models"] = [
-            model.to_json() | (asdict(self.evaluated[model.name]) if model.name in self.evaluated else {})
+            model.to_json()
+            | (asdict(self.evaluated_models[model.name]) if model.name in self.evaluated_models else {})
             for model in self.models
         ]
         values: dict[str, object] = {
@@ -99,16 +100,16 @@ class Evaluation:
             "tool_fitted": self.settings.fit_tool,
             **comparison,
         }
-        if stated := self.settings.limits.stated:
-            values |= {"limits": stated, "accepted": self.accepted, "missed": list(self.missed)}
+        if stated := self.settings.limits.stated_limits:
+            values |= {"limits": stated, "accepted": self.accepted, "missed": list(self.missed_limits)}
         values["diagnostics"] = [one.model_dump() for one in self.diagnostics]
         return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
 
     def _single(self) -> dict[str, object]:
         """Repeat the figures of a single model and of the nominal robot at top level, where programs expect them."""
-        if len(self.models) != 2 or len(self.evaluated) != 1 or self.models[0].name != "nominal":
+        if len(self.models) != 2 or len(self.evaluated_models) != 1 or self.models[0].name != "nominal":
             return {}
-        model, what = self.models[1], self.evaluated[self.models[1].name]
+        model, what = self.models[1], self.evaluated_models[self.models[1].name]
         nominal, corrected = (one.statistics_in_file_units for one in self.models)
         return {
             "model": what.model,
@@ -162,8 +163,10 @@ def evaluate(
         rows=rows.rows,
         settings=settings,
         comparison=comparison,
-        evaluated=evaluated,
-        missed=tuple(sentence for figures in judged for sentence in settings.limits.missed_by(figures)),
+        evaluated_models=evaluated,
+        missed_limits=tuple(
+            sentence for figures in judged for sentence in settings.limits.missed_by(figures)
+        ),
         diagnostics=tuple(
             diagnostic
             for figures in judged
@@ -213,13 +216,13 @@ def _text(source: ModelSource) -> str:
     return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
 
 
-def models_by_label(stated: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
+def models_by_label(models: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
     """Return the models by their names in tables: the last part of the folder, or the whole path if two are equal.
 
     Raises:
         ModelError: a model is given twice.
     """
-    sources = [model_or_folder(source) for source in stated]
+    sources = [model_or_folder(source) for source in models]
     texts = [_text(source) for source in sources]
     twice = next((text for text in texts if texts.count(text) > 1), None)
     if twice is not None:
@@ -280,7 +283,7 @@ def _diagnostics(
     """Return reasons why errors are too large for a calibrated robot, or whether a moved base or tool explains them."""
     implausible = is_implausible(figures, model)
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
-    found = check_rows(rows, model, fitted, nominal=nominal).implausible
+    found = check_rows(rows, model, fitted, nominal=nominal).implausible_findings
     if implausible and not found:
         found = (unexplained_diagnostic(model),)
     for one in found:

@@ -43,7 +43,7 @@ def follow(
         MeasurementError: the file cannot be used.
     """
     if once:
-        growth = file.read(final=True)
+        growth = file.read(is_complete=True)
         alarms = session.add(growth.rows, growth.left_out)
         alarms += session.update()
         yield SessionStep(growth, alarms, session.state, session.state.reached_accuracy, session.replanned)
@@ -62,8 +62,8 @@ def follow(
             if work is not None and worked:
                 alarms += work.result()
                 work = None
-            if worked or growth.has_changes or growth.waiting != waiting:
-                waiting, before, state = growth.waiting, state, session.state
+            if worked or growth.has_changes or growth.missing_part != waiting:
+                waiting, before, state = growth.missing_part, state, session.state
                 new = tuple(
                     point
                     for point in state.reached_accuracy
@@ -92,19 +92,19 @@ def check_programs(programs: Sequence[Path], robot: Robot, inputs: Sequence[Path
         check_program(program, robot, False, None)
 
 
-def remaining_poses_file(plan: Path, rows: Path, stated: Path | None) -> Path:
+def remaining_poses_file(plan: Path, rows: Path, requested_path: Path | None) -> Path:
     """Return the file for the remaining poses.
 
     Args:
         plan: CSV or YAML file of the plan.
         rows: the growing file of measurements.
-        stated: file for the remaining poses; None for a file next to the plan.
+        requested_path: file for the remaining poses; None for a file next to the plan.
 
     Raises:
         OutputError: the file cannot be written.
     """
     poses = plan.with_name(plan.name.removesuffix(YAML_SUFFIX).removesuffix(".csv") + ".csv")
-    rest = stated or poses.with_suffix(_REST_SUFFIX)
+    rest = requested_path or poses.with_suffix(_REST_SUFFIX)
     check_output(rest, (".csv",), "a plan", (poses, rows))
     check_output(yaml_of(rest), inputs=(yaml_of(poses),))
     return rest

@@ -20,7 +20,7 @@ from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns, mapping_warnings
 from pisigma.measurement.foreign.quantities import LEFT_OUT
-from pisigma.measurement.foreign.saved_map import check_used, map_for, save_map
+from pisigma.measurement.foreign.saved_map import check_headings_exist, map_for, save_map
 from pisigma.measurement.foreign.units import parse_units
 from pisigma.workflow.settings.importing import ImportSettings
 
@@ -71,20 +71,20 @@ class ImportedRows:
 
     Attributes:
         proposal: meaning of the columns.
-        content: the measurement file.
+        measurement_table: the measurement file.
         accounts: imported and omitted rows of every file.
         warnings: sentences with other remarks.
     """
 
     proposal: ImportProposal
-    content: MeasurementTable
+    measurement_table: MeasurementTable
     accounts: tuple[FileAccount, ...]
     warnings: tuple[str, ...]
 
     @property
     def rows(self) -> int:
         """Number of measurements."""
-        return len(self.content.table.records)
+        return len(self.measurement_table.table.records)
 
     @property
     def left_out(self) -> tuple[LeftOutRow, ...]:
@@ -99,7 +99,7 @@ class ImportedRows:
     @property
     def measurements(self) -> Measurements:
         """The imported measurements."""
-        return Measurements.from_fields(fields_of(self.content.table))
+        return Measurements.from_fields(fields_of(self.measurement_table.table))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the imported rows as a measurement file.
@@ -109,7 +109,7 @@ class ImportedRows:
         """
         files = [mapping.file.source for mapping in self.proposal.mappings]
         check_output(Path(path), (".csv",), "a measurement file", files)
-        write_atomically(Path(path), self.content.text())
+        write_atomically(Path(path), self.measurement_table.text())
 
     def to_json(self) -> dict[str, object]:
         """Return a summary of imported and omitted rows as plain values."""
@@ -138,7 +138,7 @@ def propose_import(
     units = parse_units(settings.units)
     _check_different(files)
     exports = [read_export(path, settings.decimal) for path in files]
-    check_used(settings.maps, [file.headings for file in exports])
+    check_headings_exist(settings.maps, [file.headings for file in exports])
     mappings = tuple(
         map_columns(file, map_for(settings.maps, file.headings), settings.rotation, units) for file in exports
     )
@@ -180,11 +180,11 @@ def import_rows(
     rows, joined = _joined(converted, proposal.settings)
     content = _in_new_frames(measurement_table(rows), proposal.settings.new_frame_at)
     exports = [mapping.file for mapping in proposal.mappings]
-    left_out = [*(row for file in exports for row in file.skipped), *content.left_out]
+    left_out = [*(row for file in exports for row in file.skipped_lines), *content.left_out]
     used: list[FileLine] = list(content.places)
     if joined is not None:
-        left_out += (*joined.unmatched, *joined.unused)
-        used += joined.used
+        left_out += (*joined.unmatched_rows, *joined.unneeded_rows)
+        used += joined.joined_lines
     warnings = [sentence for mapping in proposal.mappings for sentence in mapping_warnings(mapping)]
     return ImportedRows(
         proposal,

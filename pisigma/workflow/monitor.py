@@ -50,7 +50,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.validation.gate import check_rows_by_model
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workflow.recalibrate import filtered_rows, may_move
+from pisigma.workflow.recalibrate import allowed_moves, filtered_rows
 from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -100,7 +100,7 @@ class MonitoringResult:
         forecast: forecast of the error; None if there is no limit.
         warnings: sentences that warn of problems.
         cameras: cameras and boards of files of detected board corners.
-        untrusted: sessions of this call that must not be trusted.
+        untrusted_sessions: sessions of this call that must not be trusted.
         cell: folder of the cell of the model; None if it is outside a cell.
         seconds: computing time [s].
     """
@@ -114,7 +114,7 @@ class MonitoringResult:
     forecast: Forecast | None
     warnings: tuple[str, ...]
     cameras: CameraFiles | None = None
-    untrusted: tuple[UntrustedSession, ...] = ()
+    untrusted_sessions: tuple[UntrustedSession, ...] = ()
     cell: Path | None = None
     seconds: float = field(default=0.0)
 
@@ -124,7 +124,7 @@ class MonitoringResult:
         alarmed = any(chart.alarm is not None for chart in self.charts)
         exceeded = self.forecast is not None and self.forecast.limit_exceeded
         return (
-            bool(self.untrusted)
+            bool(self.untrusted_sessions)
             or alarmed
             or exceeded
             or any(one.session.recalibrate for one in self.sessions)
@@ -168,7 +168,7 @@ class MonitoringResult:
                 f"Recalibration is worthwhile: errors like those of {best.file} are expected to fall from "
                 f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run `{command}`.",
             )
-        lines = (*(one.sentence for one in self.untrusted), *alarms, *moves, *forecast, *advice)
+        lines = (*(one.sentence for one in self.untrusted_sessions), *alarms, *moves, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -178,7 +178,7 @@ class MonitoringResult:
             "model": self.model.name,
             "action": self.needs_action,
             "sessions": [one.to_json() for one in self.sessions],
-            "untrusted": [one.to_json() for one in self.untrusted],
+            "untrusted": [one.to_json() for one in self.untrusted_sessions],
             "history": [one.to_json() for one in self.records],
             "charts": [one.to_json([record.date for record in self.records]) for one in self.charts],
             "false_alarms_per_year": FALSE_ALARMS_PER_YEAR,
@@ -207,7 +207,7 @@ class MonitoringResult:
             self.warnings,
             [
                 (one.date, one.file, " ".join(said.sentence for said in one.diagnostics))
-                for one in self.untrusted
+                for one in self.untrusted_sessions
             ],
             self._marks(),
             None if self.forecast is None else self.forecast.limit_mm,
@@ -307,7 +307,7 @@ def monitor(
         forecast=forecast_of(records, settings.limit_mm) if settings.limit_mm and records else None,
         warnings=tuple(dict.fromkeys(warnings)),
         cameras=settings.cameras,
-        untrusted=tuple(untrusted),
+        untrusted_sessions=tuple(untrusted),
         cell=None if folder is None else cell_of_model(folder),
         seconds=time.perf_counter() - started,
     )
@@ -359,7 +359,9 @@ def _record(
     """Compare a session with the model."""
     stated = RecalibrationSettings(settings.moved)
     file = Path(rows.source).name
-    if implausible := check_rows_by_model(rows, model, stated.fitted, may_move(stated)).implausible:
+    if implausible := check_rows_by_model(
+        rows, model, stated.fitted, allowed_moves(stated)
+    ).implausible_findings:
         return UntrustedSession(file, date, implausible)
     elsewhere = None if settings.moved is None else frame_keys(rows, settings.moved)
     session, zeros = judge_session(model, posterior, rows, elsewhere)

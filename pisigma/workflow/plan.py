@@ -57,10 +57,10 @@ class Plan:
     """Result of `plan`: poses to measure, and the accuracy expected after measuring them.
 
     Attributes:
-        stored: the poses in their order, and the settings of the plan.
+        stored_plan: the poses in their order, and the settings of the plan.
         candidates: poses from which the planned poses were chosen.
-        curve: expected errors of the tool's position over the task, by number of poses, starting from 0 poses if there
-            are earlier measurements.
+        accuracy_curve: expected errors of the tool's position over the task, by number of poses, starting from 0 poses
+            if there are earlier measurements.
         poses_needed: number of poses with which the limit is expected to be reached; None if there is no limit, or if
             it is not reached.
         error_sources: sources of the expected remaining error, largest first.
@@ -70,9 +70,9 @@ class Plan:
         seconds: computing time [s].
     """
 
-    stored: StoredPlan
+    stored_plan: StoredPlan
     candidates: Candidates
-    curve: tuple[ExpectedAccuracy, ...]
+    accuracy_curve: tuple[ExpectedAccuracy, ...]
     poses_needed: int | None
     error_sources: tuple[RemainingError, ...]
     duration: float
@@ -83,12 +83,12 @@ class Plan:
     @property
     def poses(self) -> int:
         """Number of poses to calibrate with."""
-        return int((~self.stored.check).sum())
+        return int((~self.stored_plan.check).sum())
 
     @property
     def check_poses(self) -> int:
         """Number of poses to test the calibration with."""
-        return int(self.stored.check.sum())
+        return int(self.stored_plan.check.sum())
 
     @property
     def main_error_sources(self) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ class Plan:
 
     def to_json(self) -> dict[str, object]:
         """Return the figures as plain values: the result of `pisigma plan --json`."""
-        last, settings = self.curve[-1], self.stored.settings
+        last, settings = self.accuracy_curve[-1], self.stored_plan.settings
         return {
             "poses": self.poses,
             "check_poses": self.check_poses,
@@ -117,12 +117,12 @@ class Plan:
                     "p95_mm": point.p95 * 1e3,
                     "random_rms_mm": point.random_rms * 1e3,
                 }
-                for point in self.curve
+                for point in self.accuracy_curve
             ],
             "limit_mm": settings.limit_mm,
             "poses_needed": self.poses_needed,
             "minutes": self.duration / 60,
-            "way_points": sum(map(len, self.stored.waypoints)),
+            "way_points": sum(map(len, self.stored_plan.waypoints)),
             "main_error_sources": list(self.main_error_sources),
             "warnings": list(self.warnings),
             **({} if self.camera is None else {"camera": self.camera.to_json()}),
@@ -140,8 +140,8 @@ class Plan:
             OutputError: a file cannot be written, or a language does not support the robot.
         """
         files = [Path(program) for program in programs]
-        texts = [planned_program(self.stored, file) for file in files]
-        self.stored.write(Path(path))
+        texts = [planned_program(self.stored_plan, file) for file in files]
+        self.stored_plan.write(Path(path))
         for file, text in zip(files, texts, strict=True):
             write_atomically(file, text)
 

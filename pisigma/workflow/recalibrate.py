@@ -68,8 +68,8 @@ class Recalibration(AbstractModelResult):
         model: the recalibrated model, with all figures as its metrics, as `pisigma.load` would read it.
         parent: the model to which the rows were added.
         adaptation: adaptation of the parent to all rows.
-        gate: errors of held-out rows under every candidate.
-        moved: parts that have moved significantly.
+        candidate_choice: errors of held-out rows under every candidate.
+        movements: parts that have moved significantly.
         summary: all figures.
         seconds: computing time [s].
     """
@@ -77,8 +77,8 @@ class Recalibration(AbstractModelResult):
     model: CalibratedModel
     parent: CalibratedModel
     adaptation: Adaptation
-    gate: CandidateChoice
-    moved: tuple[Movement, ...]
+    candidate_choice: CandidateChoice
+    movements: tuple[Movement, ...]
     summary: RecalibrationSummary
     seconds: float
 
@@ -90,7 +90,7 @@ class Recalibration(AbstractModelResult):
     @property
     def position_errors_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors of held-out rows [mm]; see `AbstractModelResult`."""
-        p95 = self.gate.p95.get(self.gate.kept)
+        p95 = self.candidate_choice.p95.get(self.candidate_choice.kept)
         return None if p95 is None else p95 * 1e3, self.summary.cross_validation[self.summary.kept].rms_mm
 
     def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
@@ -144,11 +144,11 @@ def recalibrate(
     rows, again = without_known_rows(parent, posterior.with_model_names(measurements.split_sets()[0]))
     progress("checking the rows")
     right = FilteredRows(rows) if parent.kind == FLEET_PRIOR else filtered_rows(settings, parent, rows)
-    verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))
+    verdict = check_rows(right.rows, parent, settings.fitted, allowed_moves(settings))
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
-    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.indices)
+    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.wrong_row_indices)
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, with_stage(progress, "cross-validation")
@@ -161,7 +161,7 @@ def recalibrate(
         significant_movements(adaptation) if consistency is None and _believable(choice, nominal) else None
     )
     wrong = [one.row for one in outliers]
-    diagnostics = verdict.implausible or recalibration_diagnostics(
+    diagnostics = verdict.implausible_findings or recalibration_diagnostics(
         parent, choice, every, adaptation, wrong, moved or ()
     )
     moved = None if diagnostics else moved
@@ -317,7 +317,7 @@ def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurement
     return tuple(warnings)
 
 
-def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
+def allowed_moves(settings: RecalibrationSettings) -> frozenset[Move]:
     """Return what may move although the settings do not state it: a joint zero; base and tool if `moved` is None."""
     return MOVES if settings.moved is None else frozenset({"joint_zero"})
 

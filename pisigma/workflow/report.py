@@ -128,7 +128,7 @@ def report(
     diagnostics: tuple[Diagnostic, ...] = ()
     if data is not None:
         rows, remarks = _filtered_rows(loaded, read_rows(data, loaded.robot, cameras))
-        diagnostics = check_rows(rows, loaded).implausible
+        diagnostics = check_rows(rows, loaded).implausible_findings
     arm = _arm_in_images(loaded, rows, cameras, images) if images else None
     content = report_content(loaded, Path(model), rows, remarks, diagnostics, arm)
     progress("drawing")

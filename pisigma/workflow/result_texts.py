@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
+from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction_sentence
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
@@ -41,7 +41,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
     rows = [
         (str(point.poses), *(rounded(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
-        for point in planned.curve
+        for point in planned.accuracy_curve
     ]
     title = "expected errors of the tool position by number of poses"
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
@@ -49,7 +49,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
         "Main contributions to the expected error:",
         *(f"- {line}" for line in planned.main_error_sources),
     ]
-    points = sum(map(len, planned.stored.waypoints))
+    points = sum(map(len, planned.stored_plan.waypoints))
     lines = [planned.candidates.sentence, f"The poses are joined with {count_text(points, 'waypoint')}."]
     return ResultText(
         _plan_verdict(planned, files[0]),
@@ -70,10 +70,10 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
 
 def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     """Return the verdict on the expected accuracy of a calibration with the poses."""
-    last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
+    last, settings, warnings = planned.accuracy_curve[-1], planned.stored_plan.settings, planned.warnings
     cautions = f"with caution ({count_text(len(warnings), 'warning')})" if warnings else "yes"
     checked = f"; {count_text(planned.check_poses, 'pose')} will check it" if planned.check_poses else ""
-    more = "" if planned.curve[0].poses else "more "
+    more = "" if planned.accuracy_curve[0].poses else "more "
     return Verdict(
         f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm (95 %) expected for the tool position "
         f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
@@ -85,7 +85,7 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
 
 def _curve_lines(planned: Plan) -> list[str]:
     """Return sentences on the limits of the curve, and on the number of poses that the accuracy limit requires."""
-    lines, last, settings = [], planned.curve[-1], planned.stored.settings
+    lines, last, settings = [], planned.accuracy_curve[-1], planned.stored_plan.settings
     limit = settings.limit_mm
     if settings.criterion == "D" and last.rms > last.random_rms:
         lines.append(
@@ -115,23 +115,23 @@ def verification_text(verification: Verification, width: int, verbose: bool = Fa
     trust = {"better": "yes", "undecided": "not known"}.get(verification.verdict, "no")
     figures, rows = verification.comparison.models, verification.rows
     errors = f"{model_rms(figures[-1], rows)} RMS with the correction, {model_rms(figures[0], rows)} without"
-    command = f"run `{verification.recalibration}`."
+    command = f"run `{verification.recalibration_command}`."
     verdict = Verdict(
         f"{errors} ({rows} rows of {Path(verification.data).name}).",
         f"{trust}: {uncapitalised(verification.sentence)}",
-        command if verification.recalibration else _NEXT_STEPS[verification.verdict],
+        command if verification.recalibration_command else _NEXT_STEPS[verification.verdict],
     )
     warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
     shown, details = comparison_blocks(verification.comparison, verification.data, width, verbose)
     return ResultText(verdict, tuple(warnings), tuple(shown), tuple(details))
 
 
-def monitoring_text(monitoring: MonitoringResult, closing: Sequence[str] = ()) -> ResultText:
+def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[str] = ()) -> ResultText:
     """Lay out a monitoring: the verdict, a line for every session, and the conclusions from all sessions.
 
     Args:
         monitoring: the monitoring.
-        closing: sentence on the written files.
+        closing_sentences: sentence on the written files.
     """
     sessions, name = monitoring.sessions, monitoring.model.name
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
@@ -153,13 +153,13 @@ def monitoring_text(monitoring: MonitoringResult, closing: Sequence[str] = ()) -
             *([charts] if len(monitoring.records) > 1 else []),
         ),
         details if len(sessions) > _MAX_SESSIONS else (),
-        tuple(closing),
+        tuple(closing_sentences),
     )
 
 
 def _monitoring_verdict(monitoring: MonitoringResult, advice: str) -> Verdict:
     """Return the verdict on a robot from its sessions; `advice` states how to recalibrate it if this is recommended."""
-    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
+    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted_sessions)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
     last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
     alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
@@ -192,7 +192,7 @@ def recalibration_text(recalibration: Recalibration, folder: Path | None) -> Res
             sentences("which model is kept", [summary.verdict]),
             table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
         ),
-        closing=() if folder is None else (written,),
+        closing_sentences=() if folder is None else (written,),
     )
 
 
@@ -218,12 +218,12 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
     )
 
 
-def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
+def report_text(result: Report, closing_sentences: Sequence[str] = ()) -> ResultText:
     """Return a report as text: its verdict, the advice on measuring, and the acceptance of a cell.
 
     Args:
         result: the report.
-        closing: sentence on the written files.
+        closing_sentences: sentence on the written files.
     """
     content, accepted = result.content, result.acceptance
     trust = "yes: these rows were held out."
@@ -245,12 +245,12 @@ def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
         Verdict(result.verdict, trust, uncapitalised(first)),
         tuple(one.sentence for one in result.diagnostics[1:]),
         tuple(blocks),
-        closing=tuple(closing),
+        closing_sentences=tuple(closing_sentences),
     )
 
 
 def report_doubt(result: Report) -> str:
     """Return the reason why rows of a report must not be trusted or contradict the acceptance, or ""."""
     if result.acceptance is not None and result.acceptance.contradicted and not result.diagnostics:
-        return contradiction(result.acceptance)
+        return contradiction_sentence(result.acceptance)
     return " ".join(one.sentence for one in result.diagnostics)

@@ -57,7 +57,7 @@ class SolvedPoses:
         correction: correction of these joint values by the full solution [rad or m].
         branch: index of the branch of every pose.
         status: status of the full solution: REACHED, or OUTSIDE_DOMAIN beyond the measured joint values.
-        drawn: number of poses that were drawn.
+        drawn_count: number of poses that were drawn.
         refused: number of poses that were refused, by reason.
     """
 
@@ -66,14 +66,14 @@ class SolvedPoses:
     correction: Float64[Tensor, "poses dof"]
     branch: Int64[Tensor, " poses"]
     status: Int64[Tensor, " poses"]
-    drawn: int
+    drawn_count: int
     refused: dict[str, int]
 
     def select(self, rows: slice) -> "SolvedPoses":
         """Return some of the poses; `drawn` and `refused` still count all poses."""
         T, q_nominal, correction = self.T[rows], self.q_nominal[rows], self.correction[rows]
         return SolvedPoses(
-            T, q_nominal, correction, self.branch[rows], self.status[rows], self.drawn, self.refused
+            T, q_nominal, correction, self.branch[rows], self.status[rows], self.drawn_count, self.refused
         )
 
 

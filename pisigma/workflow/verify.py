@@ -83,9 +83,9 @@ class Verification:
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
         diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
-        setup_faults: setup faults that explain large errors; empty if `motion` explains them.
-        motion: parts that have moved since the model was made; None if the model or the rows do not show motions.
-        recalibration: command that updates the model; empty if this is not recommended.
+        setup_faults: setup faults that explain large errors; empty if `movements` explains them.
+        movements: parts that have moved since the model was made; None if the model or the rows do not show motions.
+        recalibration_command: command that updates the model; empty if this is not recommended.
         warnings: sentences with other remarks.
         seconds: computing time [s].
     """
@@ -101,8 +101,8 @@ class Verification:
     comparison: ModelComparison
     diagnostics: tuple[Diagnostic, ...]
     setup_faults: tuple[SetupFault, ...]
-    motion: Session | None
-    recalibration: str
+    movements: Session | None
+    recalibration_command: str
     warnings: tuple[str, ...]
     seconds: float
 
@@ -127,8 +127,8 @@ class Verification:
             **self.comparison.to_json(),
             "diagnostics": [one.model_dump() for one in self.diagnostics],
             "setup_faults": [fault.to_json() for fault in self.setup_faults],
-            "moved": [one.to_json() for one in self.motion.movements] if self.motion else [],
-            "recalibrate": self.recalibration or None,
+            "moved": [one.to_json() for one in self.movements.movements] if self.movements else [],
+            "recalibrate": self.recalibration_command or None,
             "warnings": list(self.warnings),
             "seconds": self.seconds,
         }
@@ -189,7 +189,7 @@ def verify(
     else:
         verdict = _verdict(loaded, comparison, difference, ratio, faults)
         sentence = _sentence(verdict, comparison, difference, ratio, faults)
-    wrong = (*gate.implausible, *distance_diagnostics(comparison, comparison.models[-1]))
+    wrong = (*gate.implausible_findings, *distance_diagnostics(comparison, comparison.models[-1]))
     if wrong and not faults:
         verdict, motion = "implausible", None
         sentence = f"{_NOTHING_SHOWN}: {wrong[0].sentence}"
@@ -206,8 +206,8 @@ def verify(
         comparison=comparison,
         diagnostics=wrong,
         setup_faults=faults,
-        motion=motion,
-        recalibration=_recalibration(name, rows.source, settings, motion),
+        movements=motion,
+        recalibration_command=_recalibration(name, rows.source, settings, motion),
         warnings=(
             *right.warnings,
             *_warnings(loaded, rows, comparison, faults, motion),
@@ -299,9 +299,9 @@ def _sentence(
         degrees = [one.statistics["mean"] for one in orientations if one is not None]
         figures += f", the mean orientation error {degrees[0]:.3g} deg instead of {degrees[1]:.3g} deg"
     if verdict == "setup_fault":
-        fault = next((fault for fault in faults if np.isfinite(fault.after_nominal)), None)
+        fault = next((fault for fault in faults if np.isfinite(fault.nominal_rms_after)), None)
         if fault is not None:
-            after = [length_text(length) for length in (fault.after, fault.after_nominal)]
+            after = [length_text(length) for length in (fault.rms_after, fault.nominal_rms_after)]
             figures += f"; with this corrected, the errors are {after[0]} RMS instead of {after[1]}"
         clauses = ", or ".join(dict.fromkeys(fault.clause for fault in faults))
         return (

@@ -16,7 +16,7 @@ from pisigma.cli.main import app
 from pisigma.cli.settings_options import takes_settings
 from pisigma.deployment.serve import settings as serve_settings
 from pisigma.files.errors import PisigmaError, SettingError
-from pisigma.files.setting import FILE, KEY, Option, by_key, flat_settings, settings_of
+from pisigma.files.setting import FILE, KEY, Option, flat_settings, settings_by_key, settings_of
 from pisigma.files.setting_values import checked_values, read_assignments
 from pisigma.planning import plan_settings
 from pisigma.workflow import settings as of_commands
@@ -132,7 +132,7 @@ def test_numbers_are_finite(built, words, value):
 @pytest.mark.parametrize("value", [True, False, [True]])
 @pytest.mark.parametrize("key", ["count", "width_mm", "lines", "class", "file"])
 def test_truth_in_a_file_is_not_a_number_or_a_text(key, value):
-    known = by_key(Settings)
+    known = settings_by_key(Settings)
     with refused(SettingError, option=key):
         dict(checked_values({key: value}, known, lambda key: None))
 
@@ -140,7 +140,7 @@ def test_truth_in_a_file_is_not_a_number_or_a_text(key, value):
 @pytest.mark.parametrize("key", [one.key for one in flat_settings(Settings)])
 def test_no_setting_gets_an_empty_value_by_accident(key):
     """An empty text is a text; everything else is refused, and so are several values of a single one."""
-    known = by_key(Settings)
+    known = settings_by_key(Settings)
     for stated in ([f"{key}="], [f"{key}=2", f"{key}=3"]):
         is_stated = "text" if len(stated) == 1 else "list"
         takes = {"class": "text", "file": "text", "sheet": "text", "marks": "list", "lines": "list"}.get(key)

@@ -81,7 +81,7 @@ def test_a_place_is_added_to_an_error_without_one():
     again = problem.with_place(Place("b.yaml", 7, "rows"))
     assert (again.file, again.line, again.column) == ("a.csv", 3, None)
     assert str(again) == "b.yaml, line 7, key 'rows': no rows (a.csv, line 3); add rows."
-    more = PisigmaError("no rows").followed_by(" See the log.").with_place(Place("a.csv", 3))
+    more = PisigmaError("no rows").with_text_after(" See the log.").with_place(Place("a.csv", 3))
     assert (str(more), more.line) == ("a.csv, line 3: no rows See the log.", 3)
     assert (
         str(PisigmaError(expected="a row", value=0).with_place(Place("a", 1)))
@@ -91,10 +91,10 @@ def test_a_place_is_added_to_an_error_without_one():
 
 def test_fields_survive_pickling_and_an_appended_text():
     problem = RobotError("no rows", at=Place("a.csv", 3), value=0, option="--rows")
-    for other in (pickle.loads(pickle.dumps(problem)), problem.followed_by(" See the log.")):
+    for other in (pickle.loads(pickle.dumps(problem)), problem.with_text_after(" See the log.")):
         assert type(other) is RobotError
         assert {**other.fields(), "message": ""} == {**problem.fields(), "message": ""}
-    assert str(problem.followed_by(" See the log.")) == "--rows: no rows (a.csv, line 3). See the log."
+    assert str(problem.with_text_after(" See the log.")) == "--rows: no rows (a.csv, line 3). See the log."
 
 
 def test_no_problem_ends_in_parentheses_before_its_place():

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from testing.closeness import assert_close
 
-from pisigma.files.setting import FILE, HIDDEN, NAMES, Option, attributes_of, settings_of
+from pisigma.files.setting import FILE, HIDDEN, NAMES, Option, attribute_descriptions, settings_of
 
 if TYPE_CHECKING:
     from elsewhere import Kind  # type: ignore[import-not-found]
@@ -70,7 +70,7 @@ def test_hidden_fields_are_not_options():
 
 
 def test_help_is_taken_from_the_docstring():
-    assert attributes_of(Outer)["count"].endswith("described on two lines. None: as many as fit.")
+    assert attribute_descriptions(Outer)["count"].endswith("described on two lines. None: as many as fit.")
     assert SETTINGS["count"].help.startswith("How many there are")
     assert SETTINGS["count"].help.endswith("on two lines. [default: as many as fit]")
     assert SETTINGS["kind"].help == "fast: at once; slow: later."
@@ -88,5 +88,5 @@ def test_option_units_are_converted_to_setting_units():
 def test_docstrings_without_indentation_are_read():
     """Python 3.13 removes the indentation of docstrings."""
     stripped = type("Outer", (), {"__doc__": inspect.cleandoc(Outer.__doc__)})
-    assert attributes_of(stripped) == attributes_of(Outer)
-    assert attributes_of(stripped)["count"].endswith("described on two lines. None: as many as fit.")
+    assert attribute_descriptions(stripped) == attribute_descriptions(Outer)
+    assert attribute_descriptions(stripped)["count"].endswith("described on two lines. None: as many as fit.")

@@ -4,8 +4,8 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import PisigmaError
-from pisigma.files.yaml_file import plain_content
-from pisigma.files.yaml_writing import with_value
+from pisigma.files.yaml_file import parse_plain_yaml
+from pisigma.files.yaml_writing import with_changed_value
 
 TEXT = """# a cell
 robot: ur5   # the arm
@@ -52,13 +52,13 @@ calibrate:  # nothing yet
 )
 def test_one_value_is_changed(keys, value, changed):
     stated = [int(key) if key.isdigit() else key for key in keys.split(".")]
-    found = with_value(TEXT, stated, value, "cell.yaml")
+    found = with_changed_value(TEXT, stated, value, "cell.yaml")
     assert found == f"{TEXT}\n".replace(*changed)
-    assert with_value(found, stated, value, "cell.yaml") == found
+    assert with_changed_value(found, stated, value, "cell.yaml") == found
 
 
 def test_aliased_values_cannot_be_changed_separately():
     text = "a: &same {b: 1}\nc: *same\n"
     with refused(PisigmaError, file="cell.yaml", column="a.b"):
-        with_value(text, ["a", "b"], {"x": 2}, "cell.yaml")
-    assert plain_content(text, PisigmaError, "") == {"a": {"b": 1}, "c": {"b": 1}}
+        with_changed_value(text, ["a", "b"], {"x": 2}, "cell.yaml")
+    assert parse_plain_yaml(text, PisigmaError, "") == {"a": {"b": 1}, "c": {"b": 1}}

@@ -59,7 +59,7 @@ def _recalibrate(rows: Measurements, folder: Path) -> Answer:
 
 def _monitor(rows: Measurements, folder: Path) -> Answer:
     done = monitor(original_model(), [rows])
-    return _of(not done.untrusted, [one.sentence for one in done.untrusted])
+    return _of(not done.untrusted_sessions, [one.sentence for one in done.untrusted_sessions])
 
 
 def _compare(rows: Measurements, folder: Path) -> Answer:

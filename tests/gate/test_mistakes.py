@@ -34,8 +34,8 @@ def quick():
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
 def test_the_check_notices(mistake):
     found = check_rows(
-        mistake.change(filtered_rows()), original_model(), may_move=row_check.MOVES
-    ).implausible
+        mistake.change(filtered_rows()), original_model(), allowed_moves=row_check.MOVES
+    ).implausible_findings
     assert found
     assert "*" in mistake.kinds or found[0].kind in mistake.kinds, found[0].sentence
 
@@ -48,13 +48,13 @@ def test_valid_rows_are_trusted(seed):
 @pytest.mark.parametrize("move", MOVES, ids=lambda one: one.name)
 def test_moves_of_any_size_are_not_mistakes(move):
     rows = move.change(filtered_rows())
-    assert check_rows(rows, original_model(), may_move=row_check.MOVES).trusted
+    assert check_rows(rows, original_model(), allowed_moves=row_check.MOVES).trusted
     assert not check_rows(rows, original_model()).trusted
 
 
 def test_wrong_rows_are_named():
     (mistake,) = (one for one in MISTAKES if one.name == "tracker moved by 2 mm half-way")
-    (found,) = check_rows(mistake.change(filtered_rows()), original_model()).implausible
+    (found,) = check_rows(mistake.change(filtered_rows()), original_model()).implausible_findings
     assert found.rows == tuple(f"rows.csv, line {line}" for line in range(10, 18))
 
 

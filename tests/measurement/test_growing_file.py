@@ -23,22 +23,22 @@ def file(tmp_path):
     return tmp_path / "rows.csv"
 
 
-def read(growing, final=False):
-    growth = growing.read(final)
+def read(growing, is_complete=False):
+    growth = growing.read(is_complete)
     rows = growth.rows
     return [] if rows is None else [round(value) for value in rows.q[:, 0].rad2deg().tolist()]
 
 
 def test_rows_are_read_once_and_in_order(file):
     growing = GrowingFile(file, ROBOT)
-    missing = growing.read().waiting
+    missing = growing.read().missing_part
     file.write_text(HEADER[:10])
-    incomplete = growing.read().waiting
+    incomplete = growing.read().missing_part
     assert all(str(file) in waiting for waiting in (missing, incomplete))
     assert missing != incomplete
     file.write_text(HEADER)
     growth = growing.read()
-    assert (growth.rows, growth.waiting) == (None, "")
+    assert (growth.rows, growth.missing_part) == (None, "")
     for number in range(1, 4):
         with file.open("a") as out:
             out.write(line(number))
@@ -50,18 +50,18 @@ def test_incomplete_lines_are_not_read_yet(file):
     growing = GrowingFile(file, ROBOT)
     file.write_text(HEADER + line(1) + line(2)[:-4])
     assert read(growing) == [1]
-    assert growing.read().waiting
+    assert growing.read().missing_part
     with file.open("a") as out:
         out.write(line(2)[-4:])
     growth = growing.read()
-    assert growth.waiting == ""
+    assert growth.missing_part == ""
     assert_close(growth.rows.position, [[0.102, 0.2, 0.3]], rtol=1e-12)
     assert growth.rows.line == (3,)
 
 
 def test_the_last_line_of_a_complete_file_needs_no_line_break(file):
     file.write_text((HEADER + line(1) + line(2)).rstrip())
-    assert read(GrowingFile(file, ROBOT), final=True) == [1, 2]
+    assert read(GrowingFile(file, ROBOT), is_complete=True) == [1, 2]
 
 
 @pytest.mark.parametrize("newline", ["\r\n", "\r"])
@@ -133,4 +133,4 @@ def test_a_header_that_cannot_be_used_is_refused(file):
     with refused(MeasurementError, line=1, column="force"):
         GrowingFile(file, ROBOT).read()
     with refused(MeasurementError, file="none.csv"):
-        GrowingFile(file.with_name("none.csv"), ROBOT).read(final=True)
+        GrowingFile(file.with_name("none.csv"), ROBOT).read(is_complete=True)

@@ -54,8 +54,8 @@ def test_corners_are_printed_at_their_true_distances() -> None:
         canvas.draw()
         detected = DETECTORS[board.kind](np.asarray(canvas.buffer_rgba())[..., 0].copy(), board)
         assert isinstance(detected, DetectedBoard)
-        assert len(detected.corners) == len(board.corners)
-        expected = board.corners[detected.corners, :2] * 1e3 * MM
+        assert len(detected.corner_numbers) == len(board.corners)
+        expected = board.corners[detected.corner_numbers, :2] * 1e3 * MM
         shift = (detected.pixels - expected).mean(0)
         assert_close(detected.pixels - shift, expected, atol=0.5)
 

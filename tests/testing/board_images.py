@@ -33,7 +33,10 @@ def draw_board(
     """Return a grey image of a white sheet with a board on a grey background."""
     pattern = board_pattern(board)
     image = np.full((FINER * camera.height, FINER * camera.width), 120, dtype=np.uint8)
-    for rectangle, gray in ((pattern.sheet, 210), *((black, 40) for black in pattern.black)):
+    for rectangle, gray in (
+        (pattern.sheet_rectangle, 210),
+        *((black, 40) for black in pattern.black_rectangles),
+    ):
         left, top, right, bottom = rectangle
         ends = np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]])
         pixels = (camera.project(ends @ R.T + t)[0] + 0.5) * FINER - 0.5

@@ -89,7 +89,9 @@ def corner_lines(images: Images) -> list[str]:
     """Return the lines of a file of corners, the header first."""
     dof = images.q.shape[1]
     lines = ["image,corner,u_px,v_px," + ",".join(f"q{joint + 1}_deg" for joint in range(dof))]
-    for name, q, corners, pixels in zip(images.names, images.q, images.corners, images.pixels, strict=True):
+    for name, q, corners, pixels in zip(
+        images.names, images.q, images.corner_numbers, images.pixels, strict=True
+    ):
         joints = ",".join(f"{value:.10f}" for value in np.rad2deg(q.numpy()))
         lines += [
             f"{name},{corner},{u:.6f},{v:.6f},{joints}"

@@ -17,7 +17,7 @@ ROBOT = PLAN.stored.arm.robot
 
 def found(rows: Measurements, robot: Robot = ROBOT) -> list[tuple[str, str]]:
     """Kinds and causes of the findings that make the rows implausible."""
-    return [(one.kind, one.cause) for one in check_rows(rows, robot).implausible]
+    return [(one.kind, one.cause) for one in check_rows(rows, robot).implausible_findings]
 
 
 def test_valid_and_very_few_rows_have_no_fault():
@@ -58,7 +58,7 @@ def test_an_arm_that_is_not_in_the_catalogue_is_implausible(longer, rows, said):
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 4 - 2
     noise = 5e-5 * torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     some = Measurements(q, forward_kinematics(robot.with_geometry(dh), q)[:, :3, 3] + noise)
-    kinds = {one.kind for one in check_rows(some, robot).implausible}
+    kinds = {one.kind for one in check_rows(some, robot).implausible_findings}
     assert bool(kinds & {"prior_ratio", "implausible_errors"}) == said
 
 
@@ -69,7 +69,7 @@ def test_a_reversed_joint_is_named_with_few_rows(name, rows):
     assert found(some, robot) == []
     signs = torch.ones(robot.dof)
     signs[3] = -1
-    (diagnostic,) = check_rows(replace(some, q=some.q * signs), robot).implausible
+    (diagnostic,) = check_rows(replace(some, q=some.q * signs), robot).implausible_findings
     assert (diagnostic.kind, diagnostic.cause) == ("setup_fault", "joint_sign")
     assert diagnostic.values["joints"] == (4,)
 

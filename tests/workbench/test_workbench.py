@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("viser", reason="the extra view is not installed")
 
 from pisigma.cli.main import app
-from pisigma.files.errors import PlanningError, system_fault
+from pisigma.files.errors import PlanningError, system_problem_text
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.result_text import ResultText
@@ -28,7 +28,7 @@ from pisigma.reporting.verdict import Verdict
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.report.error_map import map_of_workspace
 from pisigma.workbench.job import BusyError, Jobs, Outcome
-from pisigma.workbench.steps import rows_at_fault, side_by_side
+from pisigma.workbench.steps import side_by_side, wrong_rows_by_sentence
 from pisigma.workbench.tabs import MAX_LINES, TABS, line_numbers_in
 from pisigma.workbench.workbench import STEPS, Workbench
 from pisigma.workflow.cell.cell import Cell
@@ -243,7 +243,7 @@ def test_warnings_point_at_their_rows_by_fields(browser_with_link, bench, cell, 
         kind="mixed_rows", severity="warning", sentence="rows differ", rows=("a.csv, line 3", "a.csv, line 4")
     )
     text = ResultText(Verdict("exact", "yes", "none"), (one.sentence,))
-    monkeypatch.setitem(STEPS, "calibrate", lambda *_: Outcome(text, rows=rows_at_fault([one])))
+    monkeypatch.setitem(STEPS, "calibrate", lambda *_: Outcome(text, rows=wrong_rows_by_sentence([one])))
     ended(browser_with_link, bench, "calibrate")
     assert 'data-show="a.csv, line 3; a.csv, line 4"' in browser_with_link.ask("/tab/calibrate").body.decode()
     bench.jobs.outcomes.pop("calibrate")
@@ -313,7 +313,7 @@ def test_a_machine_that_cannot_is_not_a_defect(browser_with_link, bench, monkeyp
 
     monkeypatch.setitem(STEPS, "plan", full)
     monkeypatch.setattr(bench._uploads, "add", full)
-    expected = system_fault(problem)
+    expected = system_problem_text(problem)
     assert expected
     assert ended(browser_with_link, bench, "plan").refusal == expected
     assert json.loads(browser_with_link.ask("/upload?name=a", "POST", b"1").body)["error"] == expected

@@ -27,16 +27,16 @@ def planned(settings: PlanSettings) -> Plan:
 
 
 def test_every_planned_pose_sees_the_board(planned: Plan, settings: PlanSettings):
-    arm, camera = planned.stored.arm, settings.camera
+    arm, camera = planned.stored_plan.arm, settings.camera
     assert camera is not None
-    assert planned.poses + planned.check_poses == len(planned.stored.q) >= 14
+    assert planned.poses + planned.check_poses == len(planned.stored_plan.q) >= 14
     radius = arm.capsules.radius.numpy()
-    assert all(sees_board(arm, camera, q, radius) for q in planned.stored.q.numpy())
-    assert bool(arm.faults(planned.stored.q).allowed.all())
+    assert all(sees_board(arm, camera, q, radius) for q in planned.stored_plan.q.numpy())
+    assert bool(arm.faults(planned.stored_plan.q).allowed.all())
 
 
 def test_more_images_are_expected_to_err_less_than_random_ones(planned: Plan):
-    first, last = planned.curve
+    first, last = planned.accuracy_curve
     assert first.poses == 10
     assert first.rms > last.rms > 0
     assert last.random_rms > last.rms
@@ -52,7 +52,7 @@ def test_a_plan_is_read_with_its_camera(planned: Plan, settings: PlanSettings, t
         settings, camera=None, sensor="pose"
     )
     assert stored.arm.surroundings == CELL
-    assert_close(stored.q, planned.stored.q, atol=1e-7)
+    assert_close(stored.q, planned.stored_plan.q, atol=1e-7)
     assert (tmp_path / "poses.script").read_text().count("sleep(3.0)") == len(stored.q)
     assert not np.isnan(stored.q.numpy()).any()
 
@@ -60,7 +60,7 @@ def test_a_plan_is_read_with_its_camera(planned: Plan, settings: PlanSettings, t
 def test_limiting_factors_and_unidentifiable_parameters_are_reported(planned: Plan):
     camera = planned.camera
     assert camera is not None
-    assert_close(camera.rms, planned.curve[-1].rms, rtol=1e-9)
+    assert_close(camera.rms, planned.accuracy_curve[-1].rms, rtol=1e-9)
     for better in (camera.rms_with_more_images, camera.rms_with_exact_corners, camera.rms_with_exact_robot):
         assert 0 < better < camera.rms
     assert 0 < camera.free_displacement < 0.1

@@ -85,7 +85,7 @@ def test_models_and_rows_in_memory():
     found = pisigma.evaluate(["nominal", model], rows, settings)
     assert [one.name for one in found.models] == ["nominal", "ur5"]
     assert not found.accepted
-    assert len(found.missed) == 1
+    assert len(found.missed_limits) == 1
     printed = found.to_json()
     assert (printed["accepted"], printed["rows"], printed["model"]) == (False, 40, "ur5")
     assert printed["models"][1]["rms_mm"] == found.models[1].position.statistics["rms"]

@@ -27,8 +27,8 @@ def folder(tmp_path_factory):
 def test_plans_are_the_same(folder):
     settings = PlanSettings(count=4, check=1, candidates=100)
     one, other = (plan(source, settings) for source in (original_model(), folder))
-    assert differences(one.stored.q, other.stored.q) == []
-    assert differences(one.curve, other.curve) == []
+    assert differences(one.stored_plan.q, other.stored_plan.q) == []
+    assert differences(one.accuracy_curve, other.accuracy_curve) == []
 
 
 def test_recalibrations_are_the_same(folder):
@@ -36,7 +36,7 @@ def test_recalibrations_are_the_same(folder):
         recalibrate(source, rows_after_change(10, 2, COLLISION)) for source in (original_model(), folder)
     )
     assert differences(replace(one.model, metrics={}), replace(other.model, metrics={})) == []
-    assert differences(one.moved, other.moved) == []
+    assert differences(one.movements, other.movements) == []
 
 
 def test_sessions_and_their_history_are_the_same(folder):

@@ -39,7 +39,7 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
         for step in follow(
             session(), GrowingFile(file, ROBOT), on_new_rows=lambda rows: arrived.extend(rows.line)
         ):
-            waited.append(step.growth.waiting)
+            waited.append(step.growth.missing_part)
             seen += [] if step.growth.rows is None else step.growth.rows.line
             assert arrived == seen
     assert waited[1]

@@ -45,7 +45,7 @@ def test_exports_become_what_is_expected(
     rows.save(tmp_path / "out.csv")
     assert (tmp_path / "out.csv").read_text() == (EXPORTS / "expected.csv").read_text()
     assert (rows.warnings, rows.left_out) == ((), ())
-    assert all(file.read == file.used == 24 for file in rows.accounts)
+    assert all(file.rows_read == file.rows_used == 24 for file in rows.accounts)
 
 
 def write(tmp_path: Path, *texts: str) -> list[Path]:
@@ -59,7 +59,7 @@ def test_rows_without_a_measurement_are_left_out_and_named(tmp_path: Path):
     paths = write(tmp_path, f"{HEADER}\np1,1,2,3,4,5\np2,1,3,,,\np3,1,4,NaN,---,-\np4,1,5,6,7,8\n")
     rows = import_rows(paths)
     assert rows.rows == 2
-    assert [row.line for row in rows.content.left_out] == [3, 4]
+    assert [row.line for row in rows.measurement_table.left_out] == [3, 4]
     assert rows.to_json()["left_out"] == [
         {"file": str(paths[0]), "line": line, "reason": "nothing was measured"} for line in (3, 4)
     ]
@@ -77,7 +77,7 @@ def test_several_files_are_concatenated(tmp_path: Path):
         tmp_path, f"{HEADER}\np1,1,2,3,4,5\n", f"{HEADER.replace('mm', 'm')}\np1,1,3,.003,.004,.005\n"
     )
     rows = import_rows(paths)
-    assert rows.content.text().splitlines()[1:] == ["1,2,3,4,5", "1,3,3,4,5"]
+    assert rows.measurement_table.text().splitlines()[1:] == ["1,2,3,4,5", "1,3,3,4,5"]
     with refused(MeasurementError, file="1.csv"):
         import_rows(write(tmp_path, f"{HEADER}\np1,1,2,3,4,5\n", "name,X [mm],Y [mm],Z [mm]\np1,1,2,3\n"))
 
@@ -102,7 +102,7 @@ def test_a_saved_mapping_states_everything_for_the_next_import(tmp_path: Path):
         paths, ImportSettings(maps=({row.heading: row.target.text for row in proposal.mappings[0].columns},))
     )
     assert again.is_stated
-    assert import_rows(again).content.text() == "q1_rad,q2_rad,x_mm,y_mm,z_mm\n1,2,3000,4000,5000\n"
+    assert import_rows(again).measurement_table.text() == "q1_rad,q2_rad,x_mm,y_mm,z_mm\n1,2,3000,4000,5000\n"
 
 
 def test_doubtful_units_are_warned_of(tmp_path: Path):

@@ -92,14 +92,14 @@ def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
     save_model(original_model(), folder)
     monitoring = monitor(folder, [rows, metres])
     assert (len(monitoring.sessions), len(monitoring.records)) == (1, 1)
-    (untrusted,) = monitoring.untrusted
+    (untrusted,) = monitoring.untrusted_sessions
     assert [one.kind for one in untrusted.diagnostics] == ["setup_fault"]
     assert monitoring.needs_action
     assert len(monitor(folder, [metres]).records) == 1
     alone = monitor(original_model(), [metres])
     assert (alone.records, alone.charts, alone.trends) == ((), (), ())
     alone.save_page(tmp_path / "page.html")
-    (left_out,) = alone.untrusted
+    (left_out,) = alone.untrusted_sessions
     assert html.escape(left_out.diagnostics[0].sentence) in (tmp_path / "page.html").read_text()
 
 

@@ -29,7 +29,7 @@ def test_monitor_uses_the_other_rows(base):
     with no_type_checker():
         done = monitor(original_model(), [with_one_far_off(rows)])
         alone = monitor(original_model(), [rows])
-    assert done.untrusted == ()
+    assert done.untrusted_sessions == ()
     (session,), (right,) = (one.sessions for one in (done, alone))
     assert session.session.rows == 23
     assert session.session.verdict == right.session.verdict
@@ -43,7 +43,7 @@ def test_report_uses_the_other_rows(tmp_path):
         done = report(tmp_path, with_one_far_off(rows_after_change(24, 3)))
     assert done.diagnostics == ()
     assert done.content.rows.measurements.rows == 23
-    assert float(done.content.rows.after.position.max()) < 2e-3
+    assert float(done.content.rows.model_errors.position.max()) < 2e-3
     assert sum("rows.csv, line 7" in one for one in done.content.remarks) == 1
 
 

@@ -70,7 +70,7 @@ def test_rows_of_every_sensor_are_evaluated_and_wrong_ones_are_refused(kind: str
     verified = verify(model(), data)
     assert (verified.verdict, verified.diagnostics) == ("better", ())
     wrong = replace(data, q=data.q * torch.tensor([1.0, -1, 1, 1, 1, 1], dtype=torch.float64))
-    gate = check_rows(wrong, model(), may_move=("tool", "joint_zero"))
+    gate = check_rows(wrong, model(), allowed_moves=("tool", "joint_zero"))
     assert not gate.trusted
     (fault,) = gate.setup_faults
     assert (fault.kinds, fault.joints) == (("joint_sign",), (1,))
@@ -84,8 +84,8 @@ def test_a_moved_zero_is_named_and_is_a_movement_if_possible(kind: str) -> None:
     assert not found.trusted
     (fault,) = found.setup_faults
     assert (fault.kinds, fault.joints) == (("joint_zero",), (2,))
-    assert fault.after < 1e-6
-    assert check_rows(moved, model(), may_move=("joint_zero",)).trusted
+    assert fault.rms_after < 1e-6
+    assert check_rows(moved, model(), allowed_moves=("joint_zero",)).trusted
 
 
 @pytest.mark.parametrize("kind", ["touches", "wires from stated points"])
@@ -93,7 +93,7 @@ def test_rows_with_an_unknown_base_are_trusted(kind: str) -> None:
     data = of_kind(kind)
     elsewhere = replace(data, frame=tuple(f"new {name}" for name in data.frame))
     assert check_rows(elsewhere, model()).trusted
-    assert check_rows(replace(elsewhere, frame=data.frame), model(), may_move=("frame",)).trusted
+    assert check_rows(replace(elsewhere, frame=data.frame), model(), allowed_moves=("frame",)).trusted
 
 
 def test_an_error_of_a_socket_is_enlarged_for_the_fitted_position() -> None:

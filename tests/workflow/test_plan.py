@@ -33,7 +33,7 @@ def planned() -> Plan:
 
 
 def test_every_planned_pose_is_reachable_free_and_seen(planned: Plan):
-    robot, q = planned.stored.arm.robot, planned.stored.q.numpy()
+    robot, q = planned.stored_plan.arm.robot, planned.stored_plan.q.numpy()
     assert len(q) == 14
     margin = np.deg2rad(5)
     assert (q >= robot.limits[:, 0] + margin - 1e-9).all()
@@ -43,27 +43,30 @@ def test_every_planned_pose_is_reachable_free_and_seen(planned: Plan):
 
 
 def test_every_motion_is_free(planned: Plan):
-    stops = [torch.cat([p, q[None]]) for p, q in zip(planned.stored.waypoints, planned.stored.q, strict=True)]
+    stops = [
+        torch.cat([p, q[None]])
+        for p, q in zip(planned.stored_plan.waypoints, planned.stored_plan.q, strict=True)
+    ]
     path = torch.cat(stops)
     steps = np.linspace(0, 1, 12)[:, None]
     for start, end in zip(path[:-1].numpy(), path[1:].numpy(), strict=True):
         on_the_way = start + steps * (end - start)
         assert all(
             is_collision_free(
-                planned.stored.arm.robot, CELL.model_copy(update={"clearance_mm": 5.0}), q, RADIUS
+                planned.stored_plan.arm.robot, CELL.model_copy(update={"clearance_mm": 5.0}), q, RADIUS
             )
             for q in on_the_way
         )
-    assert bool(is_free(planned.stored.arm, path[:-1], path[1:]).all())
+    assert bool(is_free(planned.stored_plan.arm, path[:-1], path[1:]).all())
 
 
 def test_more_poses_lower_the_expected_error(planned: Plan):
-    assert [point.poses for point in planned.curve] == [10, 11]
-    assert planned.curve[0].rms > planned.curve[1].rms > 0
-    assert planned.curve[1].random_rms > planned.curve[1].rms
+    assert [point.poses for point in planned.accuracy_curve] == [10, 11]
+    assert planned.accuracy_curve[0].rms > planned.accuracy_curve[1].rms > 0
+    assert planned.accuracy_curve[1].random_rms > planned.accuracy_curve[1].rms
     assert planned.poses_needed is not None
     assert (
-        planned.curve[-1].rms < planned.curve[-1].p95 < 2e-3
+        planned.accuracy_curve[-1].rms < planned.accuracy_curve[-1].p95 < 2e-3
     )  # as in a session, 95 % of the errors keep the limit
     assert 1 <= planned.poses_needed <= 11
     assert planned.duration > 14 * 3.0
@@ -82,7 +85,7 @@ def test_the_measured_plan_is_a_measurement_file(planned: Plan, tmp_path: Path):
     assert (train.rows, test.rows) == (11, 3)
     script = (tmp_path / "poses.script").read_text()
     assert script.count("sleep(3.0)") == 14
-    assert script.count("movej") == 14 + sum(map(len, planned.stored.waypoints))
+    assert script.count("movej") == 14 + sum(map(len, planned.stored_plan.waypoints))
     assert "WAIT SEC 3.0" in (tmp_path / "poses.src").read_text()
 
 
@@ -94,7 +97,7 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "measured.csv"))
     with no_type_checker():
         more = plan("fanuc_r2000", settings, CELL)
-    assert [point.poses for point in more.curve] == [0, 2]
+    assert [point.poses for point in more.accuracy_curve] == [0, 2]
     assert more.check_poses == 0
 
 
@@ -157,9 +160,9 @@ def test_a_plan_for_a_model_uses_its_identified_tool():
     with no_type_checker():
         _, model = hybrid_under_test()
         more = plan(model, PlanSettings(count=3, check=1, candidates=30))
-    assert [point.poses for point in more.curve] == [0, 3]
-    assert 0 < more.curve[1].rms < more.curve[0].rms < 1e-3
-    assert_close(more.stored.arm.robot.tool, model.identified.tool)
+    assert [point.poses for point in more.accuracy_curve] == [0, 3]
+    assert 0 < more.accuracy_curve[1].rms < more.accuracy_curve[0].rms < 1e-3
+    assert_close(more.stored_plan.arm.robot.tool, model.identified.tool)
 
 
 def test_too_few_candidates_are_refused():
@@ -171,8 +174,8 @@ def test_too_few_candidates_are_refused():
 def test_plans_are_the_same_at_every_call():
     with no_type_checker():
         one, other = (plan("kiro3", PlanSettings(count=3, check=1, candidates=30)) for _ in range(2))
-    assert_close(one.stored.q, other.stored.q)
-    assert one.curve == other.curve
+    assert_close(one.stored_plan.q, other.stored_plan.q)
+    assert one.accuracy_curve == other.accuracy_curve
 
 
 def test_all_poses_are_planned_if_the_free_space_has_two_parts():
@@ -185,7 +188,7 @@ def test_all_poses_are_planned_if_the_free_space_has_two_parts():
         PlanSettings(count=12, check=4, candidates=300, limit_mm=2.0),
         CELL.model_validate({"boxes": boxes}),
     )
-    q = planned.stored.q
+    q = planned.stored_plan.q
     assert len(q) == 16
-    assert int(planned.stored.check.sum()) == 4
+    assert int(planned.stored_plan.check.sum()) == 4
     assert len(q[:, 0].sign().unique()) == 1

@@ -57,7 +57,7 @@ def test_its_folder_is_a_model_that_can_be_recalibrated_again(after_collision, t
     second = recalibrate(tmp_path / "again", rows_after_change(10, 3, COLLISION))
     assert second.summary.parent.kind == "recalibration"
     assert len(second.summary.parent.sha256) == 64
-    assert not second.moved
+    assert not second.movements
 
 
 def test_a_base_that_is_stated_to_have_moved_is_identified_again():
@@ -80,7 +80,7 @@ def test_a_wrong_row_at_the_time_of_a_collision_is_excluded_and_named(after_coll
     (outlier,) = result.summary.outliers
     assert (outlier.row, result.summary.rows, result.warnings) == (3, 9, ())
     assert_close(outlier.residual_mm, 5.0, atol=0.5)
-    assert [one.what for one in result.moved] == ["joint 3"]
+    assert [one.what for one in result.movements] == ["joint 3"]
     test = rows_after_change(100, 50, COLLISION, noise=0.0)
     errors = [
         (test.position - poses_of_rows(one.model, test)[:, :3, 3]).square().mean() ** 0.5
@@ -100,14 +100,14 @@ def test_a_row_that_no_error_explains_is_left_out_and_named():
         (9, rows.place(9)),
     ]
     assert result.summary.rows == 12
-    assert not result.moved
+    assert not result.movements
 
 
 def test_rows_of_another_arm_are_not_trusted(tmp_path):
     rows = rows_after_change(10, 2)
     result = recalibrate(original_model(), replace(rows, q=rows.q.flip(0)))
     assert [one.severity for one in result.diagnostics] == ["implausible"]
-    assert not result.moved
+    assert not result.movements
     assert result.summary.changed == NOT_TRUSTED
     with refused(AcceptanceError, file=tmp_path / "no"):
         result.save(tmp_path / "no")

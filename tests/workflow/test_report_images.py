@@ -44,12 +44,13 @@ def test_predictions_are_those_of_both_arms(arm):
     assert found.nominal_rms > 2 * found.calibrated_rms
     assert found.halvings == pytest.approx(math.log2(found.nominal_rms / found.calibrated_rms))
     for one in found.images:
-        assert one.measured.shape == (len(BOARD.corners), 2)
+        assert one.measured_corners.shape == (len(BOARD.corners), 2)
         # corner 0 is the origin of the tool, at which the links end
         for predicted in (one.nominal, one.calibrated):
-            assert_close(predicted.links[-1], predicted.corners[0], atol=1e-6)
+            assert_close(predicted.frame_pixels[-1], predicted.corner_pixels[0], atol=1e-6)
         off = [
-            np.linalg.norm(those.corners - one.measured, axis=1) for those in (one.nominal, one.calibrated)
+            np.linalg.norm(those.corner_pixels - one.measured_corners, axis=1)
+            for those in (one.nominal, one.calibrated)
         ]
         assert off[1].max() < 40
 

@@ -39,7 +39,7 @@ def test_a_moved_zero_is_named_in_images(arm, name):
     session = values["sessions"][0] if name == "monitor" else values
     assert [one["what"] for one in session["moved"]] == [f"joint {JOINT + 1}"]
     if name == "recalibrate":
-        assert result.moved[0].shift == pytest.approx(np.rad2deg(MOVED), abs=0.6)
+        assert result.movements[0].shift == pytest.approx(np.rad2deg(MOVED), abs=0.6)
 
 
 def test_a_model_stores_the_scatter_of_its_joints(arm):
@@ -50,4 +50,4 @@ def test_rows_of_a_model_are_those_of_the_file(arm):
     """The weights that a calibration computes must not make its rows look like others."""
     model, rows, _, _ = arm
     assert model.provenance.data_sha256 == rows.content_hash()
-    assert pisigma.evaluate(model, rows).evaluated["so101"].trained_on
+    assert pisigma.evaluate(model, rows).evaluated_models["so101"].trained_on

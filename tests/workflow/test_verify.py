@@ -87,7 +87,7 @@ def test_a_setup_fault_decides_the_verdict(geometric):
     assert not found.accepted
     (fault,) = found.setup_faults
     assert (fault.kinds, fault.joints) == (("joint_sign",), (2,))
-    assert fault.after < fault.after_nominal
+    assert fault.rms_after < fault.nominal_rms_after
     assert found.to_json()["setup_faults"][0]["kinds"] == ["joint_sign"]
 
 
@@ -176,4 +176,4 @@ def test_measured_ur5(shared_data):
     assert good.ratio < 0.25
     (setup_fault,) = verify(model, joints(rows, [1, 1, 1, 1, -1.0, 1])).setup_faults
     assert (setup_fault.kinds, setup_fault.joints) == (("joint_sign",), (4,))
-    assert setup_fault.after < 2e-4
+    assert setup_fault.rms_after < 2e-4

@@ -27,7 +27,7 @@ def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: t
     shared = bases.joints_in_common(first, second)
     q, moved = other.state.q.clone(), other.q_corrected.clone()
     q[:, :shared], moved[:, :shared] = one.state.q[:, :shared], one.q_corrected[:, :shared]
-    other = Postures(JointState(q, other.state.stated), moved)
+    other = Postures(JointState(q, other.state.conditions), moved)
     apart = _tool_root(bases, second, other) - _tool_root(bases, first, one)
     return float(apart.square().sum((1, 2)).mean().sqrt())
 

@@ -364,7 +364,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     view = sensor_view_of(here)
     used = parameters_by_sensor(view, covariance_of(here.normal)).tolist()
     for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
-        if sensor.certain:
+        if sensor.is_stated:
             continue
         sigma = float(view.noise[k])
         unit = sensor.unit if sensor.sigma is None else "stated"

@@ -171,7 +171,7 @@ class HybridCalibrator:
             geometry=with_aligned_frames(solved, refined),
             correction=refined.correction,
             coverage=JointCoverage.from_joints(self.geometric_calibrator.robot, solved.problem.q),
-            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
+            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.is_stated},
             unknowns=refined.design.unknowns,
             effective_unknowns=refined.posterior.effective_unknowns,
             rounds=refined.rounds,
@@ -201,14 +201,14 @@ class HybridCalibrator:
             one.residual.norm(dim=1) * one.weight_root / view.scales[k] for k, one in enumerate(values)
         ]
         weights = [
-            ((distance < _GROSS) | one.certain).to(distance)
+            ((distance < _GROSS) | one.is_stated).to(distance)
             for distance, one in zip(distances, values, strict=True)
         ]
         rows = Rows.from_linearisation(
             design, (point - problem.nominal)[problem.active], values, weights, group
         )
         pairs = zip(noise, values, strict=True)
-        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
+        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.is_stated):
             # The geometry explains exact data, so features would only fit the errors of the linearisation.
             search = FeatureSearch(rows, noise, prior_scale, [], progress)
             return search.try_derived_feature(search.geometry, None)

@@ -143,7 +143,7 @@ def held_out_row_errors(
             errors[chosen] = (one.residual.norm(dim=1) * one.weight_root)[chosen]
     return tuple(
         None
-        if one.certain
+        if one.is_stated
         else SensorErrors(group[one.row], one.residual.norm(dim=1) * one.weight_root, *errors)
         for one, *errors in zip(values, held_out, weights, strict=True)
     )
@@ -168,7 +168,7 @@ def _with_own_unknowns(
     """Fit unknowns on which only held-out rows depend to these rows, starting with their values from all rows."""
     moving = torch.zeros(design.active_count, dtype=torch.bool, device=x.device)
     for one in values:
-        if not one.certain:
+        if not one.is_stated:
             moving |= (one.geometry_derivatives[~held[one.row]] != 0).flatten(0, 1).any(0)
     own = (~moving).nonzero()[:, 0]
     if not len(own):
@@ -177,7 +177,7 @@ def _with_own_unknowns(
     for _ in range(_REFITS):
         blocks = []
         for one in _values(design, x):
-            chosen = held[one.row] | one.certain
+            chosen = held[one.row] | one.is_stated
             columns = one.geometry_derivatives[chosen][..., own] * one.weight_root[chosen][:, None, None]
             errors = one.residual[chosen] * one.weight_root[chosen][:, None]
             blocks.append((columns.flatten(0, 1), errors.flatten()))

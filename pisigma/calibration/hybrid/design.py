@@ -180,7 +180,7 @@ class Rows:
             SensorCount(
                 sensor.residual.numel() / sensor.repeat_variance_factor,
                 sensor.has_stated_noise,
-                sensor.certain,
+                sensor.is_stated,
                 sensor.repeat_variance_factor,
             )
             for sensor in self.values
@@ -196,7 +196,7 @@ class Rows:
     def held_out_rows(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
         """Return the rows of the given groups, without sensors whose values are given."""
         rows = self.select_groups(groups)
-        kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
+        kept = [sensor.select(slice(0, 0)) if sensor.is_stated else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
     def folds(self, count: int, max_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
@@ -280,7 +280,7 @@ def robust_weights(
         IdentificationError: a residual is not finite.
     """
     weights = []
-    counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in values]
+    counts = [0.0 if sensor.is_stated else float(sensor.residual.numel()) for sensor in values]
     for number, sensor in enumerate(values):
         loss = problem.loss_for_sensor(problem.sensors[number])
         distance = sensor.residual.norm(dim=1) * sensor.weight_root
@@ -290,7 +290,7 @@ def robust_weights(
                 value=sensor.name,
                 remedy="calibrate the geometry alone, and look for huge values in the measurements",
             )
-        if sensor.certain or isinstance(loss, SquaredLoss):
+        if sensor.is_stated or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))
             continue
         taken = effective_unknowns * counts[number] / max(sum(counts), 1.0)

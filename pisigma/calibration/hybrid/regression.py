@@ -257,7 +257,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             X = design.columns(sensor, slice(None))
             root = sensor.weight_root[:, None]
             y = sensor.residual * root
-            group = torch.full_like(sensor.row, -1) if sensor.certain else rows.group[sensor.row]
+            group = torch.full_like(sensor.row, -1) if sensor.is_stated else rows.group[sensor.row]
             parts.append(
                 (
                     (X * root[..., None]).flatten(0, 1),

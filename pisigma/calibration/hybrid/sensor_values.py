@@ -31,7 +31,7 @@ class SensorValues:
         residual: measured minus predicted values.
         weight_root: 1 / standard deviation if the rows state it, otherwise 1.
         has_stated_noise: whether the rows state their standard deviations.
-        certain: whether the values are given, not measured.
+        is_stated: whether the values are given, not measured.
         other_row: index of the other row for distances between the targets of two rows; otherwise None.
         other_joint_derivatives: derivative with respect to the joint values of the other row.
         repeat_variance_factor: factor >= 1 on the variance, because values of several targets in one configuration
@@ -45,7 +45,7 @@ class SensorValues:
     residual: Float64[Tensor, "values components"]
     weight_root: Float64[Tensor, " values"]
     has_stated_noise: bool
-    certain: bool
+    is_stated: bool
     other_row: Int64[Tensor, " values"] | None = None
     other_joint_derivatives: Float64[Tensor, "values components dof"] | None = None
     repeat_variance_factor: float = 1.0
@@ -132,7 +132,7 @@ class SensorValues:
 
     def downweight_correlated(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
         """Return the rows with smaller weights if residuals of several targets in a configuration are correlated."""
-        if not len(self.row) or self.certain or self.other_row is not None:
+        if not len(self.row) or self.is_stated or self.other_row is not None:
             return self
         key = renumber(configuration[self.row])
         groups = int(key.max()) + 1
@@ -204,7 +204,7 @@ def sensor_values(
     values = []
     for sensor, columns in zip(problem.sensors, collected, strict=True):
         row, J, r, other = (torch.cat(column) for column in zip(*columns, strict=True))
-        joints, paired = J[..., len(problem.active) :] * direction, sensor.paired
+        joints, paired = J[..., len(problem.active) :] * direction, sensor.is_paired
         root = torch.ones_like(r[:, 0]) if sensor.sigma is None else 1 / sensor.sigma[row]
         values.append(
             SensorValues(
@@ -215,7 +215,7 @@ def sensor_values(
                 residual=r.contiguous(),
                 weight_root=root,
                 has_stated_noise=sensor.sigma is not None,
-                certain=sensor.certain,
+                is_stated=sensor.is_stated,
                 other_row=row + 1 if paired else None,
                 other_joint_derivatives=other * direction if paired else None,
             )

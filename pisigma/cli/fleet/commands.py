@@ -153,7 +153,7 @@ def _print_run(result: "FleetRun") -> None:
     refused, folder = len(result.refused), result.results.parent
     unchanged = f"; nothing was due in {result.unchanged}" if result.unchanged else ""
     verdict = Verdict(
-        f"{result.done} of {count_text(result.cells, 'cell')} are done{unchanged}; {result.seconds:.1f} s.",
+        f"{result.cells_done} of {count_text(result.cells, 'cell')} are done{unchanged}; {result.seconds:.1f} s.",
         f"no: {count_text(refused, 'cell')} need attention."
         if refused
         else "see `pisigma fleet status` for the errors of each robot.",
@@ -162,7 +162,7 @@ def _print_run(result: "FleetRun") -> None:
         "Done",
     )
     lines = [f"{cell}: {reason}" for cell, reason in result.refused]
-    print_screen(verdict, lines, closing=[f"Results written to {result.results}."])
+    print_screen(verdict, lines, closing_sentences=[f"Results written to {result.results}."])
 
 
 def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None:

@@ -133,7 +133,7 @@ def _print_pose(
     """Print the solutions of one pose."""
     import numpy as np
 
-    from pisigma.reporting.solution_text import failure, solution_records, solution_text
+    from pisigma.reporting.solution_text import failure_sentence, solution_records, solution_text
     from pisigma.workflow.load import stated_pose
 
     T, places = stated_pose(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
@@ -149,7 +149,7 @@ def _print_pose(
         print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
         print_result(solution_text(solution, solver), verbose=False)
-    if problem := failure(solution, places, one_suffices=all_branches):
+    if problem := failure_sentence(solution, places, one_suffices=all_branches):
         exit_with_error(problem)
 
 

@@ -43,7 +43,7 @@ def camera(
 
 def _verdict(calibrated: "CameraCalibration", out: Path) -> Verdict:
     """Return the verdict on the intrinsics of a camera."""
-    detection, covered = calibrated.detection, calibrated.calibration.covered.mean()
+    detection, covered = calibrated.detection, calibrated.calibration.covered_cells.mean()
     _, fx, sigma, _ = calibrated.parameters[0]
     return Verdict(
         f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "

@@ -19,12 +19,12 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with the re
 
 
 def check_outputs(
-    out: Path, suffixes: tuple[str, ...], what: str, page: Path | None, inputs: Sequence[Path | None]
+    out: Path, suffixes: tuple[str, ...], content_name: str, page: Path | None, inputs: Sequence[Path | None]
 ) -> None:
     """Make sure that both files may be written; see `check_output`."""
     from pisigma.files.output_file import check_output, check_page
 
-    check_output(out, suffixes, what, inputs)
+    check_output(out, suffixes, content_name, inputs)
     if page is not None:
         check_page(page, [*inputs, out])
 

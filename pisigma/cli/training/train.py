@@ -115,7 +115,7 @@ def _print_training(summary: "TrainingSummary", folder: Path, seconds: float, ve
         f"{rows.used} rows used, {rows.left_out} left out{reason}.",
         f"Model written to {folder} in {seconds:.1f} s; its README.md has all figures.",
     ]
-    print_screen(verdict, blocks=blocks, closing=closing, verbose=verbose)
+    print_screen(verdict, blocks=blocks, closing_sentences=closing, verbose=verbose)
 
 
 def _worst_joint(summary: "TrainingSummary") -> str:

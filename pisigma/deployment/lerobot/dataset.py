@@ -79,7 +79,7 @@ def correct_lerobot_dataset(
         raise OutputError("the output exists", at=Place(out), option="out", remedy="choose another folder")
     corrections = {
         key: LeRobotCorrection.load(model, names, units, calibration, prefix)
-        for key, names in source.names.items()
+        for key, names in source.feature_names.items()
     }
     record[prefix] = {key: one.version for key, one in corrections.items()}
     try:

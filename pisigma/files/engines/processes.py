@@ -204,7 +204,7 @@ class RayEngine(AbstractEngine):
 
 COMMAND = (
     "import sys; sys.path[:] = filter(None, sys.path); "
-    "from pisigma.files.engines.processes import serve; serve()"
+    "from pisigma.files.engines.processes import serve_requests; serve_requests()"
 )
 """Program of the process, without the working directory on the path; `PYTHONSAFEPATH` needs Python 3.11."""
 
@@ -302,7 +302,7 @@ class BackgroundProcess:
         )
 
 
-def serve() -> None:
+def serve_requests() -> None:
     """Compute the requests of the process at the other end of stdin and stdout, until that process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interrupts
     if hasattr(os, "nice"):

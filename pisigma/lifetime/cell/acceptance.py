@@ -6,7 +6,7 @@ from typing import Any
 
 from pisigma.lifetime.cell.events import Event
 from pisigma.validation.held_out.model_comparison import QuantityErrors
-from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose, pooled_deviation
+from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose, pooled_scatter
 from pisigma.validation.uncertainty.budget import UncertaintyBudget
 from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
@@ -105,7 +105,7 @@ class Acceptance:
         square = (self.measured.errors.statistics["rms"] / 1e3) ** 2 / 3
         freedom = min(self.budget.effective_degrees_of_freedom, _MAX_FREEDOM)
         limit = float(stats.f.ppf(_EXPLAINED, self.measured.rows, freedom))
-        return square > limit * self.budget.combined**2
+        return square > limit * self.budget.combined_uncertainty**2
 
     @property
     def not_stated(self) -> tuple[str, ...]:
@@ -114,7 +114,7 @@ class Acceptance:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, lengths in mm."""
-        span, scatter = self.temperature_span, pooled_deviation(self.repeats)
+        span, scatter = self.temperature_span, pooled_scatter(self.repeats)
         return {
             "model": self.model,
             "limit_mm": self.limit_mm,

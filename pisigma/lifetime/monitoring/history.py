@@ -19,7 +19,13 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.training_rows import repeated_row_warnings
 
 _SESSION = TypeAdapter(Session)
-_VALUES = ("numbers", "steps", "kind", "file")
+_VALUES = {
+    "numbers": "rows_numbers",
+    "rounding_steps": "rows_steps",
+    "step_index": "rows_kind",
+    "file_index": "rows_file",
+}
+"""Key of every field of `RowValues` in a history."""
 _ZEROS = {
     "shift": "shift",
     "sigma": "deviation",
@@ -140,7 +146,7 @@ def sorted_sessions(records: Sequence[Record]) -> tuple[Record, ...]:
 
 def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:
     stream = io.BytesIO()
-    rows = {} if values is None else {f"rows_{name}": getattr(values, name).numpy() for name in _VALUES}
+    rows = {} if values is None else {key: getattr(values, field).numpy() for field, key in _VALUES.items()}
     np.savez(
         stream,
         **{key: getattr(zeros, field).numpy() for field, key in _ZEROS.items()},
@@ -154,9 +160,9 @@ def _unpacked(content: bytes) -> tuple[JointZeros, RowValues | None]:
         zeros = JointZeros(
             **{f: torch.from_numpy(arrays[key].astype(np.float64)) for f, key in _ZEROS.items()}
         )
-        if not {f"rows_{name}" for name in _VALUES} <= set(arrays):
+        if not {*_VALUES.values()} <= set(arrays):
             return zeros, None
-        return zeros, RowValues(*(torch.from_numpy(arrays[f"rows_{name}"]) for name in _VALUES))
+        return zeros, RowValues(*(torch.from_numpy(arrays[key]) for key in _VALUES.values()))
 
 
 def new_rows(

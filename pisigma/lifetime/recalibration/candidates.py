@@ -31,11 +31,11 @@ from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows
+from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows_diagnostic
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import ErrorPredictor, pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.pose_statistics import image_deviation
+from pisigma.validation.held_out.pose_statistics import image_position_rms
 from pisigma.validation.held_out.trained_calibrations import Calibrator, fit, judgeable_rows
 
 Kept = Literal["recalibrated", "old", "scratch"]
@@ -310,9 +310,9 @@ def recalibration_diagnostics(
     if len(wrong_rows) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
         chosen[list(wrong_rows)] = True
-        return (too_many_wrong_rows(rows, chosen),)
+        return (too_many_wrong_rows_diagnostic(rows, chosen),)
     if choice.kept == "scratch" and (
-        implausible := check_rows(rows, parent.nominal or parent.robot).implausible
+        implausible := check_rows(rows, parent.nominal or parent.robot).implausible_findings
     ):
         return implausible
     return (
@@ -333,7 +333,7 @@ def _large_errors(
     )
     setup = adaptation.problem.setup
     rows = setup.weighted_rows(setup.measurements, adaptation.arm.geometry)
-    usual = max(math.sqrt(3) * (0.0 if math.isnan(noise) else noise), image_deviation(rows))
+    usual = max(math.sqrt(3) * (0.0 if math.isnan(noise) else noise), image_position_rms(rows))
     missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
     if error > share * parent.robot.reach:
         sentence = (

@@ -16,7 +16,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import ChangeLimits, RobotClass, plausible_share
-from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows
+from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows_diagnostic
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
@@ -70,7 +70,7 @@ def session_diagnostics(
     """
     if len(session.outliers) > MIN_WRONG_SHARE * rows.rows:
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
-        return (too_many_wrong_rows(rows, torch.tensor(wrong)),)
+        return (too_many_wrong_rows_diagnostic(rows, torch.tensor(wrong)),)
     limit = plausible_share(model.robot) * model.robot.reach
     if session.rms_after > limit:
         sentence = (

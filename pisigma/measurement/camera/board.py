@@ -110,10 +110,10 @@ class Board:
         kind: kind of board.
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
         dictionary: dictionary of the markers: a `Dictionary` or a `TagFamily`.
-        scale_deviation: relative standard deviation of the scale, common to all lengths of the board; None if not
+        scale_sigma: relative standard deviation of the scale, common to all lengths of the board; None if not
             stated.
         flatness: distance between two parallel planes that enclose the surface [m]; 0 for a perfectly flat board.
-        printed: ratio of the lengths as printed, which the other attributes state, to the intended lengths.
+        print_scale: ratio of the lengths as printed, which the other attributes state, to the intended lengths.
     """
 
     name: str
@@ -123,9 +123,9 @@ class Board:
     kind: BoardKind = "checkerboard"
     marker: float = 0.0
     dictionary: str = ""
-    scale_deviation: float | None = None
+    scale_sigma: float | None = None
     flatness: float = 0.0
-    printed: float = 1.0
+    print_scale: float = 1.0
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Board":

@@ -30,22 +30,23 @@ class BoardPose:
         t: origin of the board in the camera's frame [m].
         cofactor: covariance of the pose error (shift of t [m], rotation vector of R in the camera's frame [rad]) if
             the noise of the corners is 1 px.
-        distance: length of every corner's residual, divided by the relative standard deviation of the corner [px].
-        weight: weight of every corner by the robust loss.
+        residual_length: length of every corner's residual, divided by the relative standard deviation of the corner
+            [px].
+        robust_weight: weight of every corner by the robust loss.
         intrinsics_jacobian: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame
             [rad]) with respect to the intrinsics.
-        root: square root of the corners' information on the intrinsics k, with the pose eliminated and a noise of 1
-            px: `root (k - present) = residual`.
-        residual: right-hand side of the equation of `root` [px].
+        information_root: square root of the corners' information on the intrinsics k, with the pose eliminated and a
+            noise of 1 px: `root (k - present) = residual`.
+        residual: right-hand side of the equation of `information_root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
     t: Float64[np.ndarray, " 3"]
     cofactor: Float64[np.ndarray, "6 6"]
-    distance: Float64[np.ndarray, " corners"]
-    weight: Float64[np.ndarray, " corners"]
+    residual_length: Float64[np.ndarray, " corners"]
+    robust_weight: Float64[np.ndarray, " corners"]
     intrinsics_jacobian: Float64[np.ndarray, "6 9"]
-    root: Float64[np.ndarray, "9 9"]
+    information_root: Float64[np.ndarray, "9 9"]
     residual: Float64[np.ndarray, " 9"]
 
 
@@ -91,7 +92,7 @@ def solve_board_pose(
         np.linalg.norm(residual, axis=1),
         weight,
         intrinsics_jacobian=-inverse @ factor[:POSE, POSE:-1],
-        root=factor[POSE:-1, POSE:-1],
+        information_root=factor[POSE:-1, POSE:-1],
         residual=factor[POSE:-1, -1],
     )
 

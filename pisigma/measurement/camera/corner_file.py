@@ -245,7 +245,7 @@ def _images(
         names=tuple(of_image),
         q=rows.q[first],
         lines=tuple(table.lines[row] for row in first.tolist()),
-        corners=tuple(number[chosen].astype(int) for chosen in of_image.values()),
+        corner_numbers=tuple(number[chosen].astype(int) for chosen in of_image.values()),
         pixels=tuple(pixels[chosen] for chosen in of_image.values()),
         sigma=tuple(sigma[chosen] for chosen in of_image.values()),
     )

@@ -23,7 +23,7 @@ from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatabil
 from pisigma.measurement.camera.solved_images import (
     SolvedImages,
     corner_noise,
-    prior_deviations,
+    prior_sigmas,
     solve_images,
 )
 from pisigma.measurement.dataset import Measurements
@@ -55,7 +55,7 @@ class Images:
         names: names of the images, in the file's order.
         q: joint values of every image [rad or m].
         lines: line number of the first corner of every image.
-        corners: numbers of the corners in every image.
+        corner_numbers: numbers of the corners in every image.
         pixels: pixels of the corners in every image [px].
         sigma: standard deviation of every corner, up to a common factor that is estimated; empty if all are equal.
     """
@@ -64,7 +64,7 @@ class Images:
     names: tuple[str, ...]
     q: Float64[torch.Tensor, "images dof"]
     lines: tuple[int, ...]
-    corners: tuple[np.ndarray, ...]
+    corner_numbers: tuple[np.ndarray, ...]
     pixels: tuple[Float64[np.ndarray, "_corners 2"], ...]
     sigma: tuple[Float64[np.ndarray, " _corners"], ...] = ()
 
@@ -72,7 +72,7 @@ class Images:
     def relative_sigma(self) -> tuple[Float64[np.ndarray, " _corners"], ...]:
         """Standard deviations of the corners relative to their median."""
         if not self.sigma:
-            return tuple(np.ones(len(corners)) for corners in self.corners)
+            return tuple(np.ones(len(corners)) for corners in self.corner_numbers)
         usual = np.median(np.concatenate(self.sigma))
         return tuple(of_image / usual for of_image in self.sigma)
 
@@ -93,7 +93,7 @@ def image_measurements(
         board: the board, with its numbering of the corners.
         is_fixed: whether the camera is fixed and the board is on the flange.
         repeatability: repeatability of the robot.
-        intrinsics: whether the camera's intrinsics are fixed, have their prior, or are free; see `prior_deviations`.
+        intrinsics: whether the camera's intrinsics are fixed, have their prior, or are free; see `prior_sigmas`.
 
     Returns:
         One row per image, in the frame of the board with the camera as target (the other way round for a fixed camera),
@@ -109,7 +109,7 @@ def image_measurements(
         poses, bend = _board_poses(images, present, board, bend, loss)
         return poses
 
-    solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
+    solved = solve_images(camera, prior_sigmas(camera, intrinsics), solve, loss, images.source)
     rotations, positions, changes = zip(*(_target_pose(pose, is_fixed) for pose in solved.poses), strict=True)
     count, names = len(rotations), (board.name, camera.name)
     frame, target = reversed(names) if is_fixed else names
@@ -145,8 +145,8 @@ def _readings(
     if solved.sigma.any():
         J = np.stack(changes) @ solved.intrinsics.pose_jacobian
         readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, pose_jacobian=J).csv_cells
-    if board.scale_deviation is not None:
-        readings[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
+    if board.scale_sigma is not None:
+        readings[SCALE_COLUMN] = (f"{board.scale_sigma:.17g}",) * count
     return readings
 
 
@@ -161,7 +161,7 @@ def _board_poses(
     Raises:
         MeasurementError: the corners of an image do not fit the board.
     """
-    observed = images.corners, images.pixels, images.relative_sigma
+    observed = images.corner_numbers, images.pixels, images.relative_sigma
     for _ in range(_MAX_BEND_ITERATIONS):
         corners = bent_corners(board, bend)
         poses = [
@@ -185,7 +185,7 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
         MeasurementError: an image does not fit the board or shows it mirrored.
     """
     for name, line, pose in zip(images.names, images.lines, poses, strict=True):
-        residual = float(np.median(pose.distance))
+        residual = float(np.median(pose.residual_length))
         if not residual < MAX_MEDIAN_RESIDUAL:
             raise MeasurementError(
                 f"the corners of image '{name}' do not fit a board of {board.rows} x {board.columns} corners: their "
@@ -248,7 +248,7 @@ def update_bend(
     bend: Float64[np.ndarray, " 3"],
     board: Board,
     camera: Camera,
-    numbers: Sequence[np.ndarray],
+    corner_numbers: Sequence[np.ndarray],
     pixels: Sequence[Float64[np.ndarray, "_corners 2"]],
     sigma: Sequence[Float64[np.ndarray, " _corners"]],
     poses: Sequence[BoardPose],
@@ -263,7 +263,7 @@ def update_bend(
         bend: heights with which the poses were solved [m].
         board: the board, with its flatness.
         camera: the camera.
-        numbers: numbers of the corners in every image.
+        corner_numbers: numbers of the corners in every image.
         pixels: pixels of the corners in every image [px].
         sigma: standard deviation of every corner relative to the median.
         poses: poses of the board in every image.
@@ -272,11 +272,11 @@ def update_bend(
     of_corner, corners = bend_shapes(board), bent_corners(board, bend)
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(_SHAPES), -prior * bend[:, None]], 1)]
-    for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
+    for number, at, deviation, pose in zip(corner_numbers, pixels, sigma, poses, strict=True):
         residual, J, point_jacobian = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
         height_jacobian = (point_jacobian @ pose.R[:, 2])[..., None] * of_corner[number][:, None]
         columns = np.concatenate([J, height_jacobian, residual[..., None]], -1)
-        weighted = np.sqrt(pose.weight)[:, None, None] * columns
+        weighted = np.sqrt(pose.robust_weight)[:, None, None] * columns
         rows.append(triangular_factor(weighted.reshape(-1, columns.shape[-1]))[POSE:-1, POSE:])
     stacked = np.concatenate(rows)
     heights: np.ndarray = bend + np.linalg.lstsq(stacked[:, :-1], stacked[:, -1], rcond=None)[0]

@@ -13,12 +13,12 @@ class Pattern:
     """A printed board, seen along its z axis (x to the right, y down).
 
     Attributes:
-        black: left, top, right and bottom edge [m] of black rectangles that do not overlap.
-        sheet: left, top, right and bottom edge of the white sheet, including its margin [m].
+        black_rectangles: left, top, right and bottom edge [m] of black rectangles that do not overlap.
+        sheet_rectangle: left, top, right and bottom edge of the white sheet, including its margin [m].
     """
 
-    black: Float64[np.ndarray, "rectangles 4"]
-    sheet: Float64[np.ndarray, " 4"]
+    black_rectangles: Float64[np.ndarray, "rectangles 4"]
+    sheet_rectangle: Float64[np.ndarray, " 4"]
 
 
 def board_pattern(board: Board) -> Pattern:

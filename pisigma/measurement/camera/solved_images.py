@@ -38,7 +38,7 @@ _CELLS = 8
 """Number of rows and columns of cells of an image, for its coverage by the board."""
 
 
-def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.ndarray, " 9"]:
+def prior_sigmas(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.ndarray, " 9"]:
     """Return prior standard deviations of a camera's intrinsics [px; distortion without unit], 0 if fixed.
 
     Args:
@@ -63,14 +63,14 @@ class SolvedImages:
 
     Attributes:
         camera: the camera of the file, whose intrinsics are the prior mean.
-        present: the camera with the intrinsics with which the poses were solved.
-        sigma: prior standard deviations, see `prior_deviations`.
+        camera_of_poses: the camera with the intrinsics with which the poses were solved.
+        sigma: prior standard deviations, see `prior_sigmas`.
         poses: pose of the board in every image.
         noise: standard deviation of u and v of a corner [px].
     """
 
     camera: Camera
-    present: Camera
+    camera_of_poses: Camera
     sigma: Float64[np.ndarray, " 9"]
     poses: tuple[BoardPose, ...]
     noise: float
@@ -79,10 +79,10 @@ class SolvedImages:
     def intrinsics(self) -> ImageIntrinsics:
         """Information of every image on the intrinsics, with the derivatives of its pose."""
         rows = (len(self.poses), len(INTRINSICS))
-        stated = (self.present.intrinsics, self.camera.intrinsics, self.sigma)
+        stated = (self.camera_of_poses.intrinsics, self.camera.intrinsics, self.sigma)
         return ImageIntrinsics(
             np.stack([pose.intrinsics_jacobian for pose in self.poses]),
-            np.stack([pose.root for pose in self.poses]) / self.noise,
+            np.stack([pose.information_root for pose in self.poses]) / self.noise,
             np.stack([pose.residual for pose in self.poses]) / self.noise,
             *(np.broadcast_to(values, rows) for values in stated),
         )
@@ -102,7 +102,7 @@ def solve_images(
 
     Args:
         camera: the camera of the file.
-        sigma: prior standard deviations, see `prior_deviations`.
+        sigma: prior standard deviations, see `prior_sigmas`.
         solve: function that returns the poses for given intrinsics.
         loss: robust loss of the corners, for their noise.
         source: name of the images in messages.
@@ -133,7 +133,7 @@ def solve_images(
 
 def corner_noise(poses: Sequence[BoardPose], loss: AbstractLoss) -> float:
     """Return the standard deviation of u and v of a corner, estimated from the residuals of all images [px]."""
-    distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
+    distance = torch.from_numpy(np.concatenate([pose.residual_length for pose in poses]))
     used = float(POSE * len(poses))
     scale = max(float(loss.scale(distance, 2, used)), MIN_NOISE)
     return max(float(loss.sigma(distance, 2, used, scale)), MIN_NOISE)
@@ -160,18 +160,18 @@ class IntrinsicCalibration:
         camera: the calibrated camera, with standard deviations of its intrinsics.
         noise: standard deviation of u and v of a corner [px].
         tilts: angle between the board's normal and the camera's axis in every image [rad].
-        disagreement: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): it is 1 if
+        scatter_ratio: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): it is 1 if
             the model fits, and larger for a bowed board. Standard deviations are multiplied by it.
-        disagrees: whether the ratio is larger than chance explains (three standard deviations).
-        covered: whether a corner was seen in each cell of the image, row by row.
+        has_excess_scatter: whether the ratio is larger than chance explains (three standard deviations).
+        covered_cells: whether a corner was seen in each cell of the image, row by row.
     """
 
     camera: Camera
     noise: float
     tilts: Float64[np.ndarray, " images"]
-    disagreement: float
-    disagrees: bool
-    covered: Bool[np.ndarray, "cells cells"]
+    scatter_ratio: float
+    has_excess_scatter: bool
+    covered_cells: Bool[np.ndarray, "cells cells"]
 
 
 def calibrate_intrinsics(
@@ -213,9 +213,9 @@ def calibrate_intrinsics(
         camera=replace(start, sigma=tuple(sigma.tolist())),
         noise=solved.noise,
         tilts=np.array([np.arccos(min(abs(pose.R[2, 2]), 1.0)) for pose in solved.poses]),
-        disagreement=disagreement,
-        disagrees=disagreement > 1 + 3 / math.sqrt(2 * freedom),
-        covered=_covered(views, size),
+        scatter_ratio=disagreement,
+        has_excess_scatter=disagreement > 1 + 3 / math.sqrt(2 * freedom),
+        covered_cells=_covered(views, size),
     )
 
 
@@ -251,7 +251,7 @@ def _solved(
     views: Sequence[BoardView], start: Camera, names: Collection[str], loss: AbstractLoss
 ) -> SolvedImages:
     """Solve all poses and the intrinsics in `names`; other intrinsics are fixed."""
-    sigma = _UNINFORMATIVE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
+    sigma = _UNINFORMATIVE * prior_sigmas(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
     sigma *= [name in names for name in INTRINSICS]
 
     def poses(camera: Camera) -> list[BoardPose]:

@@ -68,7 +68,7 @@ def read_fields(
         table = read_table(path)
         layout = read_header(table, robot)
     except MeasurementError as problem:
-        raise problem.followed_by(import_hint(path)) from None
+        raise problem.with_text_after(import_hint(path)) from None
     return _complete(_sound_rows(table, layout, robot), on_bad_row)
 
 
@@ -129,7 +129,9 @@ def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
     if not data.left_out or (on_bad_row == "leave_out" and data.rows):
         return data
     problem, more = data.left_out[0].error(data.source), len(data.left_out) - 1
-    raise problem.followed_by(f" {more} more row{'s have' if more > 1 else ' has'} a fault." if more else "")
+    raise problem.with_text_after(
+        f" {more} more row{'s have' if more > 1 else ' has'} a fault." if more else ""
+    )
 
 
 def _labels(layout: Layout) -> FieldLabels:
@@ -272,8 +274,8 @@ def import_hint(path: str | os.PathLike[str]) -> str:
         mapping = map_columns(read_export(path, max_bytes=_MAX_BYTES), {}, None, {})
     except MeasurementError:
         return ""
-    is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)
-    if mapping.possible_joints or not (is_half or (mapping.has_joints and mapping.has_measured)):
+    is_half = (mapping.has_joints or mapping.has_measured_values) and set(KEYS) & set(mapping.quantities)
+    if mapping.possible_joints or not (is_half or (mapping.has_joints and mapping.has_measured_values)):
         return ""
     return f" The command `{_command(mapping)}` would read it as an export."
 
@@ -289,7 +291,7 @@ def is_measurement_file(path: str | os.PathLike[str]) -> bool:
 
 def _command(mapping: FileMapping) -> str:
     words = ["pisigma", "import", shlex.quote(mapping.file.source)]
-    if not mapping.has_measured:
+    if not mapping.has_measured_values:
         words += ["MEASURED", "--join", "point"]
     elif not mapping.has_joints:
         words += ["JOINTS", "--join", "point"]

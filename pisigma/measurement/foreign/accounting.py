@@ -39,46 +39,46 @@ class FileAccount:
 
     Attributes:
         file: the file.
-        read: number of rows of the file.
-        used: number of rows that were imported, or whose joint values were joined to an imported row.
+        rows_read: number of rows of the file.
+        rows_used: number of rows that were imported, or whose joint values were joined to an imported row.
         left_out: rows that were not used.
     """
 
     file: str
-    read: int
-    used: int
+    rows_read: int
+    rows_used: int
     left_out: tuple[LeftOutRow, ...]
 
     def to_json(self) -> dict[str, object]:
         """Return the numbers of rows as plain values for JSON."""
         return {
             "file": self.file,
-            "rows_read": self.read,
-            "rows_used": self.used,
+            "rows_read": self.rows_read,
+            "rows_used": self.rows_used,
             "rows_left_out": len(self.left_out),
         }
 
 
 def count_rows(
-    read: Sequence[FileLine], used: Sequence[FileLine], left_out: Sequence[LeftOutRow]
+    read_lines: Sequence[FileLine], used_lines: Sequence[FileLine], left_out: Sequence[LeftOutRow]
 ) -> tuple[FileAccount, ...]:
     """Count the rows of every file.
 
     Args:
-        read: file and line of all rows that were read, in order.
-        used: file and line of the rows that were imported or joined.
+        read_lines: file and line of all rows that were read, in order.
+        used_lines: file and line of the rows that were imported or joined.
         left_out: the rows that were left out.
     """
-    places = Counter(used) + Counter((row.file, row.line) for row in left_out)
-    assert places == Counter(read), "a row was lost or counted twice"
+    places = Counter(used_lines) + Counter((row.file, row.line) for row in left_out)
+    assert places == Counter(read_lines), "a row was lost or counted twice"
     return tuple(
         FileAccount(
             file,
             count,
-            sum(place[0] == file for place in used),
+            sum(place[0] == file for place in used_lines),
             tuple(row for row in left_out if row.file == file),
         )
-        for file, count in Counter(file for file, _ in read).items()
+        for file, count in Counter(file for file, _ in read_lines).items()
     )
 
 

@@ -32,7 +32,7 @@ from pisigma.measurement.foreign.quantities import (
     measurement_column,
 )
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
-from pisigma.measurement.foreign.time_stamps import ambiguous_date, day_first, has_open_date, iso_day
+from pisigma.measurement.foreign.time_stamps import ambiguous_date, day_first, has_ambiguous_date, iso_day
 from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, to_file_unit
 from pisigma.robot.se3 import quaternion_from_rotation
 
@@ -98,10 +98,10 @@ def check_complete(mapping: FileMapping) -> None:
             value=", ".join(mapping.rotations),
             remedy=f"state one of {', '.join(mapping.rotations)}, or none to omit the rotation",
         )
-    if mapping.incomplete:
+    if mapping.incomplete_rotation:
         raise MeasurementError(
             expected="all values of a rotation",
-            value=Phrase(", ".join(column.heading for column in mapping.incomplete)),
+            value=Phrase(", ".join(column.heading for column in mapping.incomplete_rotation)),
             at=header,
             remedy="add the missing column, or omit the rotation with --rotation none",
         )
@@ -194,7 +194,7 @@ def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
     first, dates = day_first(texts), []
     for line, text in zip(file.lines, texts, strict=True):
         day = "" if is_missing(text) else iso_day(text, first)
-        if day is None and has_open_date(text) and iso_day(text, True) is not None:
+        if day is None and has_ambiguous_date(text) and iso_day(text, True) is not None:
             raise ambiguous_date(Place(file.source, line, column.heading), text)
         dates.append(text if day is None else day)
     return tuple(dates)

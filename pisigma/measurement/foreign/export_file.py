@@ -49,8 +49,8 @@ class ExportFile:
         records: cells of every row, in the order of the file.
         lines: line numbers of the rows.
         dialect: format of the file.
-        skipped: lines that are not used as rows: lines that contain numbers but are not rows, lines after the first row
-            that are neither rows nor blank, and rows that summarise others.
+        skipped_lines: lines that are not used as rows: lines that contain numbers but are not rows, lines after the
+            first row that are neither rows nor blank, and rows that summarise others.
     """
 
     source: str
@@ -62,14 +62,14 @@ class ExportFile:
     records: list[list[str]]
     lines: tuple[int, ...]
     dialect: Dialect
-    skipped: tuple[LeftOutRow, ...]
+    skipped_lines: tuple[LeftOutRow, ...]
 
     @property
     def row_places(self) -> tuple[FileLine, ...]:
         """File and line of all rows, including skipped lines."""
         return (
             *((self.source, line) for line in self.lines),
-            *((one.file, one.line) for one in self.skipped),
+            *((one.file, one.line) for one in self.skipped_lines),
         )
 
     def column(self, index: int) -> list[str]:
@@ -132,7 +132,7 @@ def read_export(
         records=[[cells[i][k] for k in used] for i in rows],
         lines=tuple(lines[i][0] for i in rows),
         dialect=dialect,
-        skipped=tuple(sorted(skipped, key=lambda row: row.line)),
+        skipped_lines=tuple(sorted(skipped, key=lambda row: row.line)),
     )
 
 

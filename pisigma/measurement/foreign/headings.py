@@ -30,7 +30,7 @@ class Heading:
             [deg]".
         unit: symbol of the unit, or "".
         unknown_unit: text in brackets that is not a unit.
-        side: "commanded" or "measured" if the heading states it, otherwise "".
+        value_kind: "commanded" or "measured" if the heading states it, otherwise "".
         is_column_name: whether the heading is the name of a column of measurement files, in upper or lower case.
     """
 
@@ -38,7 +38,7 @@ class Heading:
     name: str
     unit: str
     unknown_unit: str = ""
-    side: str = ""
+    value_kind: str = ""
     is_column_name: bool = False
 
 

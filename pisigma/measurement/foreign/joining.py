@@ -17,8 +17,8 @@ from pisigma.measurement.foreign.time_stamps import (
     check_restarts,
     date_of,
     day_first,
-    has_open_date,
-    is_clock,
+    has_ambiguous_date,
+    is_time_of_day,
     seconds_of,
 )
 
@@ -33,21 +33,23 @@ class JoinedRows:
 
     Attributes:
         rows: the measurements in the order of the list, with joint values.
-        used: file and line of the rows of the log that were joined.
-        unmatched: rows of both files that have no partner.
-        unused: rows of the log that need no partner, because another row has the same point or nothing was measured
-            at their time.
+        joined_lines: file and line of the rows of the log that were joined.
+        unmatched_rows: rows of both files that have no partner.
+        unneeded_rows: rows of the log that need no partner, because another row has the same point or nothing was
+            measured at their time.
         warnings: warnings, each a sentence.
     """
 
     rows: ConvertedRows
-    used: tuple[FileLine, ...]
-    unmatched: tuple[LeftOutRow, ...]
-    unused: tuple[LeftOutRow, ...]
+    joined_lines: tuple[FileLine, ...]
+    unmatched_rows: tuple[LeftOutRow, ...]
+    unneeded_rows: tuple[LeftOutRow, ...]
     warnings: tuple[str, ...]
 
 
-def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float = 0.2) -> JoinedRows:
+def join_rows(
+    measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, max_time_difference: float = 0.2
+) -> JoinedRows:
     """Join a list of measurements and a log of joint values.
 
     Rows of the list keep their order; rows without a partner are left out and listed. Poses in the log are commanded
@@ -58,7 +60,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
         joints: rows with joint values.
         by: "point": by names of points, ignoring groups before "::", case and leading zeros; "order": by position in
             the files; "time": with the row of the log that is nearest in time.
-        within: largest difference of time stamps [s].
+        max_time_difference: largest difference of time stamps [s].
 
     Raises:
         MeasurementError: there is no column to join by, the numbers of rows differ, a name has different joint
@@ -69,10 +71,10 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
     elif by == "point":
         partner = _by_point(measured, joints)
     else:
-        partner = _by_time(measured, joints, within)
+        partner = _by_time(measured, joints, max_time_difference)
     matched = np.flatnonzero(partner >= 0)
     if not len(matched):
-        raise _no_partner(measured, joints, by, within)
+        raise _no_partner(measured, joints, by, max_time_difference)
     warnings = [] if by == "point" else _check_names(measured, joints, partner, by)
     commanded = [name for name in joints.cells if is_measured(name)]
     kept = [name for name in joints.cells if name not in (*commanded, *KEYS, *measured.cells)]
@@ -90,19 +92,19 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
             f"{joints.source}: {names} are left out, because the measurements are in {measured.source}."
         )
     if by == "time":
-        warnings += _moving(joints, partner[matched], within)
+        warnings += _moving(joints, partner[matched], max_time_difference)
     alone = np.setdiff1d(np.arange(len(joints.lines)), partner)
     known = np.intersect1d(alone, _partners(joints, partner, by))
     same_point = "another row has the same point and joint values"
     why = "nothing was measured at its time" if by == "time" else same_point
     return JoinedRows(
         rows=rows,
-        used=tuple(joints.row_places[row] for row in np.unique(partner[matched])),
-        unmatched=(
+        joined_lines=tuple(joints.row_places[row] for row in np.unique(partner[matched])),
+        unmatched_rows=(
             *_left_out(measured, np.flatnonzero(partner < 0), f"the row has no partner in {joints.source}"),
             *_left_out(joints, np.setdiff1d(alone, known), f"the row has no partner in {measured.source}"),
         ),
-        unused=tuple(_left_out(joints, known, why)),
+        unneeded_rows=tuple(_left_out(joints, known, why)),
         warnings=tuple(warnings),
     )
 
@@ -236,7 +238,7 @@ def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " r
     times = np.empty(len(rows.lines))
     for row, text in enumerate(texts):
         seconds = seconds_of(text, first)
-        if seconds is None and has_open_date(text) and seconds_of(text, True) is not None:
+        if seconds is None and has_ambiguous_date(text) and seconds_of(text, True) is not None:
             raise ambiguous_date(Place(rows.source, rows.lines[row]), text)
         if seconds is None:
             raise MeasurementError(
@@ -254,7 +256,7 @@ def _stamps(rows: ConvertedRows) -> list[str]:
     _check_key(rows, "time", "time stamps")
     dates = rows.cells.get("date", ("",) * len(rows.lines))
     return [
-        f"{date} {text}" if date and is_clock(text) else text
+        f"{date} {text}" if date and is_time_of_day(text) else text
         for date, text in zip(dates, rows.cells["time"], strict=True)
     ]
 

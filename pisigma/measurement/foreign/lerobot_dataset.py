@@ -50,14 +50,14 @@ class LeRobotDataset:
         folder: folder of the data set.
         version: layout, one of `_VERSIONS`.
         fps: frames per second.
-        names: names of the values of every feature of joint values (`STATE`, `_ACTION`), in their order.
+        feature_names: names of the values of every feature of joint values (`STATE`, `_ACTION`), in their order.
         files: Parquet files of the frames, in the order of the episodes.
     """
 
     folder: Path
     version: str
     fps: float
-    names: dict[str, tuple[str, ...]]
+    feature_names: dict[str, tuple[str, ...]]
     files: tuple[Path, ...]
 
     @staticmethod
@@ -101,16 +101,16 @@ class LeRobotDataset:
         for file in self.files:
             yield file, read_table(file)
 
-    def frames(self, table: "pyarrow.Table", key: str, file: Path) -> Float[np.ndarray, "frames values"]:
+    def frames(self, table: "pyarrow.Table", feature: str, file: Path) -> Float[np.ndarray, "frames values"]:
         """Return the values of a feature in one of the `tables`, (frames, values).
 
         Raises:
             MeasurementError: the column is missing, or a frame has a different number of values.
         """
-        at, count = Place(file, column=key), len(self.names[key])
-        if key not in table.column_names:
-            raise MeasurementError(expected=f"a column {key}", at=at)
-        values = table.column(key).combine_chunks()
+        at, count = Place(file, column=feature), len(self.feature_names[feature])
+        if feature not in table.column_names:
+            raise MeasurementError(expected=f"a column {feature}", at=at)
+        values = table.column(feature).combine_chunks()
         flat = values.flatten().to_numpy(zero_copy_only=False)
         if values.null_count or len(flat) != count * len(table):
             raise MeasurementError(expected=f"{count} values in every frame", at=at)
@@ -252,11 +252,11 @@ def read_joint_log(
             "--set lerobot_units=normalized",
         )
     source = LeRobotDataset.open(dataset)
-    if STATE not in source.names:
+    if STATE not in source.feature_names:
         raise MeasurementError(
-            expected=f"the feature {STATE}", value=Phrase(", ".join(source.names)), option="files"
+            expected=f"the feature {STATE}", value=Phrase(", ".join(source.feature_names)), option="files"
         )
-    names = source.names[STATE]
+    names = source.feature_names[STATE]
     motors = joint_motors(names, prefix)
     if not motors:
         raise MeasurementError(

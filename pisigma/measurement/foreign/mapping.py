@@ -54,13 +54,13 @@ class FileMapping:
         file: the export.
         columns: all columns, in the order of the file.
         rotations: encodings of rotations that fit the headings; () if at most one does.
-        incomplete: columns that contain some but not all values of a rotation; () if there are none.
+        incomplete_rotation: columns that contain some but not all values of a rotation; () if there are none.
     """
 
     file: ExportFile
     columns: tuple[MappedColumn, ...]
     rotations: tuple[str, ...] = ()
-    incomplete: tuple[MappedColumn, ...] = ()
+    incomplete_rotation: tuple[MappedColumn, ...] = ()
 
     @property
     def quantities(self) -> dict[str, MappedColumn]:
@@ -73,7 +73,7 @@ class FileMapping:
         return bool(joints_of(self.quantities))
 
     @property
-    def has_measured(self) -> bool:
+    def has_measured_values(self) -> bool:
         """Whether the file contains kept columns other than joint values, names and times."""
         return bool(set(self.quantities) - {*KEYS, *joints_of(self.quantities)})
 
@@ -120,7 +120,7 @@ class FileMapping:
 
 
 def map_columns(
-    file: ExportFile, stated: Mapping[str, str], rotation: str | None, units: Mapping[UnitKind, str]
+    file: ExportFile, targets: Mapping[str, str], rotation: str | None, units: Mapping[UnitKind, str]
 ) -> FileMapping:
     """Determine the quantities and units of the columns of a file.
 
@@ -130,7 +130,7 @@ def map_columns(
 
     Args:
         file: the export.
-        stated: targets by heading or number of a column, see `parse_target`; names of columns that the file does not
+        targets: targets by heading or number of a column, see `parse_target`; names of columns that the file does not
             have are ignored.
         rotation: encoding of the rotations, `NO_ROTATION` to leave them out, None to determine it from the headings.
         units: symbols by kind of unit, for columns for which the file does not state a unit.
@@ -141,7 +141,7 @@ def map_columns(
     if rotation is not None:
         check_choice(MeasurementError, "--rotation", rotation, (NO_ROTATION, *ROTATIONS))
     proposal = Proposal(file)
-    for name, text in stated.items():
+    for name, text in targets.items():
         _take_stated(proposal, name, text)
     propose_quantities(proposal, rotation)
     columns = tuple(proposal.columns[index] for index in range(len(file.headings)))
@@ -159,7 +159,7 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
         indices = [int(name) - 1]
     for index in indices:
         target, written = parse_target(text, name), _written_unit(proposal, index)
-        if target.unit and written and target.unit != written and not target.overrides:
+        if target.unit and written and target.unit != written and not target.overrides_unit:
             raise MeasurementError(
                 option="--map",
                 expected=f"{written}, as the file states",

@@ -62,7 +62,7 @@ class Proposal:
         target = ColumnTarget(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
 
-    def names(self, *kinds: UnitKind) -> dict[str, list[int]]:
+    def columns_by_name(self, *kinds: UnitKind) -> dict[str, list[int]]:
         """Return the columns not yet mapped, by name, without columns whose heading states a unit of another kind.
 
         Args:
@@ -76,17 +76,17 @@ class Proposal:
         return names
 
     def assign_columns(
-        self, group: Mapping[str, str], names: Mapping[str, list[int]], side: _Side, reason: str
+        self, group: Mapping[str, str], names: Mapping[str, list[int]], value_kind: _Side, reason: str
     ) -> None:
         """Map columns by their names; of commanded and measured columns, keep only one kind."""
         for name, quantity in group.items():
-            sides = {self.headings[index].side for index in names[name]}
-            chosen = next(one for one in (side, "", *sides) if one in sides)
+            sides = {self.headings[index].value_kind for index in names[name]}
+            chosen = next(one for one in (value_kind, "", *sides) if one in sides)
             for index in names[name]:
-                if self.headings[index].side == chosen:
+                if self.headings[index].value_kind == chosen:
                     self.set_quantity(index, quantity, reason)
                 else:
-                    self.set_quantity(index, LEFT_OUT, f"the {side} values are used")
+                    self.set_quantity(index, LEFT_OUT, f"the {value_kind} values are used")
 
     def leave_out(self, group: Mapping[str, object], names: Mapping[str, list[int]], reason: str) -> None:
         """Leave out columns by their names."""
@@ -115,7 +115,9 @@ def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
     _take_rotation(proposal, rotation)
     _take_third_coordinate(proposal)
     ranks = {name: rank for rank, name in enumerate(MEANINGS)}
-    for name, indices in sorted(proposal.names().items(), key=lambda one: ranks.get(one[0], len(ranks))):
+    for name, indices in sorted(
+        proposal.columns_by_name().items(), key=lambda one: ranks.get(one[0], len(ranks))
+    ):
         for index in indices:
             _take_other(proposal, name, index)
     _take_names(proposal)
@@ -214,7 +216,7 @@ def _take_joints(proposal: Proposal) -> None:
     stated = [one for one in proposal.columns.values() if joints_of([one.target.quantity])]
     if not all(one.is_stated for one in stated):
         return
-    names = proposal.names("angle", "length")
+    names = proposal.columns_by_name("angle", "length")
     makers = [one for one in MAKERS if one.joints and (not one.position or one.position in names)]
     general = (MakerHeadings("", f"{name}#") for name in JOINT_NAMES)
     best: dict[str, int] = {}
@@ -240,11 +242,13 @@ def _take_joints(proposal: Proposal) -> None:
 def _take_position(proposal: Proposal) -> None:
     """Map the measured coordinates; a position that is only commanded is left out."""
     for group in POSITIONS:
-        names, taken = proposal.names("length"), proposal.quantities
+        names, taken = proposal.columns_by_name("length"), proposal.quantities
         missing = {name: one for name, one in zip(group, POSITION, strict=True) if one not in taken}
         if not missing or not set(missing) <= set(names):
             continue
-        if {proposal.headings[index].side for name in missing for index in names[name]} == {"commanded"}:
+        if {proposal.headings[index].value_kind for name in missing for index in names[name]} == {
+            "commanded"
+        }:
             proposal.leave_out(missing, names, "commanded, not measured")
         else:
             proposal.assign_columns(missing, names, "measured", "heading")
@@ -271,8 +275,8 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
     columns = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     names = {
         name: indices
-        for name, indices in proposal.names("angle").items()
-        if any(proposal.headings[index].side != "commanded" for index in indices)
+        for name, indices in proposal.columns_by_name("angle").items()
+        if any(proposal.headings[index].value_kind != "commanded" for index in indices)
     }
     matches = {} if columns & proposal.quantities else encodings_of(set(names))
     if rotation == NO_ROTATION:
@@ -340,7 +344,7 @@ def _take_third_coordinate(proposal: Proposal) -> None:
     ]
     free = {
         index: proposal.headings[index].unit
-        for name, indices in proposal.names("length").items()
+        for name, indices in proposal.columns_by_name("length").items()
         if name not in (*MEANINGS, *open_rotations)
         for index in indices
         if proposal.file.numbers(index)

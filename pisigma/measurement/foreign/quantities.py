@@ -49,20 +49,20 @@ class ColumnTarget:
         quantity: quantity such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` if the column is left out.
         unit: symbol of the unit of the cells; "" if there is no unit or it is unknown.
         is_reversed: whether the cells have the opposite sign.
-        overrides: whether the unit applies although the file states another.
+        overrides_unit: whether the unit applies although the file states another.
     """
 
     quantity: str
     unit: str = ""
     is_reversed: bool = False
-    overrides: bool = False
+    overrides_unit: bool = False
 
     @property
     def text(self) -> str:
         """Text of the target for `--map`."""
         named = measurement_column(self.quantity, self.unit)
         named = named or "_".join(filter(None, (self.quantity, self.unit)))
-        return f"{LEFT_OUT * self.is_reversed}{named}{_ALTHOUGH * self.overrides}"
+        return f"{LEFT_OUT * self.is_reversed}{named}{_ALTHOUGH * self.overrides_unit}"
 
     @property
     def missing_unit_kind(self) -> UnitKind | None:

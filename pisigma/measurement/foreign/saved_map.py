@@ -61,7 +61,7 @@ def map_for(maps: StatedMaps, headings: Sequence[str]) -> Mapping[str, str]:
     return max(fitting, key=lambda one: len(set(one) & there), default={})
 
 
-def check_used(maps: StatedMaps, headings: Sequence[Sequence[str]]) -> None:
+def check_headings_exist(maps: StatedMaps, headings: Sequence[Sequence[str]]) -> None:
     """Refuse a heading in a mapping that no file has.
 
     Raises:

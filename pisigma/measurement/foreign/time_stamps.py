@@ -61,7 +61,7 @@ def seconds_of(text: str, day_first: bool | None = None) -> float | None:
 def iso_day(text: str, day_first: bool | None = None) -> str | None:
     """Return the day of a date, with or without clock time, in the form of ISO 8601; None for other texts."""
     match = _DATE.fullmatch(text.strip())
-    if match is None or (match[5] and not is_clock(match[5])):
+    if match is None or (match[5] and not is_time_of_day(match[5])):
         return None
     day = _day(match, day_first)
     return None if day is None else day.date().isoformat()
@@ -73,7 +73,7 @@ def date_of(text: str) -> str:
     return text.strip()[: match.start(5) if match[5] is not None else None].strip(" T,") if match else ""
 
 
-def is_clock(text: str) -> bool:
+def is_time_of_day(text: str) -> bool:
     """Return whether a time stamp is a clock time without a date."""
     return bool(_CLOCK.fullmatch(text.strip()))
 
@@ -85,7 +85,7 @@ def day_first(texts: Sequence[str]) -> bool | None:
     return is_day if is_day != is_month else None
 
 
-def has_open_date(text: str) -> bool:
+def has_ambiguous_date(text: str) -> bool:
     """Return whether the date of a time stamp depends on the order of day and month."""
     match = _DATE.match(text.strip())
     return bool(match and _is_open(match) and match[1] != match[3])
@@ -102,22 +102,22 @@ def ambiguous_date(at: Place, text: str) -> MeasurementError:
 
 
 def check_restarts(
-    times: Float64[np.ndarray, " rows"], within: float, source: str, lines: Sequence[int]
+    times: Float64[np.ndarray, " rows"], max_time_difference: float, source: str, lines: Sequence[int]
 ) -> None:
     """Check that rows close in time belong to one recording, because the wrong recording might otherwise be joined.
 
     Args:
         times: time stamps in the order of the file [s].
-        within: largest difference of time stamps that are joined [s].
+        max_time_difference: largest difference of time stamps that are joined [s].
         source: the file.
         lines: lines of its rows.
 
     Raises:
         MeasurementError: time stamps restart, and the same times occur before and after the restart.
     """
-    restarts = np.diff(times, prepend=times[:1]) < -within
+    restarts = np.diff(times, prepend=times[:1]) < -max_time_difference
     order = np.argsort(times, kind="stable")
-    close = np.diff(times[order]) <= within
+    close = np.diff(times[order]) <= max_time_difference
     if (close & (np.diff(np.cumsum(restarts)[order]) != 0)).any():
         row = int(restarts.argmax())
         raise MeasurementError(

@@ -105,7 +105,7 @@ class CornerSensor(AbstractSensor):
     name = "corner"
     unit = "m"
     components = 6
-    turning = True
+    depends_on_rotation = True
     readings = SensorReadings(
         "corner",
         (ReadingColumn(NOISE_COLUMN, ("mm",)), ReadingColumn(WEIGHT_COLUMN, is_text=True), *COLUMNS),

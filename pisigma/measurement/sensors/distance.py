@@ -126,7 +126,7 @@ class AnchorSensor(AbstractSensor):
 
     @classmethod
     def uncalibrated_unknowns(
-        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated_owners: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the anchor's stated position with a zero offset of 0.
 
@@ -140,7 +140,7 @@ class AnchorSensor(AbstractSensor):
                 f"anchor '{owner}' was not calibrated and its position is not given",
                 at=measurements.place_of(row, "anchor"),
                 value=owner,
-                remedy=nearest_choice(owner, calibrated),
+                remedy=nearest_choice(owner, calibrated_owners),
             )
         return torch.cat([position, position.new_zeros(1)])
 
@@ -269,7 +269,7 @@ class PairSensor(AbstractSensor):
     name = "pair"
     unit = "m"
     components = 1
-    paired = True
+    is_paired = True
     determines_frame = False
     measured: Float64[Tensor, " rows"]
     present: Bool[Tensor, " rows"]

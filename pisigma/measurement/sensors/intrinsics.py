@@ -53,18 +53,19 @@ class ImageIntrinsics:
     Attributes:
         pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
             respect to k.
-        root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit variances.
-        residual: right-hand side of the equations of `root`.
+        information_root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit
+            variances.
+        residual: right-hand side of the equations of `information_root`.
         intrinsics: intrinsics at which the images were linearised.
-        stated: intrinsics of the camera file, the prior mean.
+        prior_mean: intrinsics of the camera file, the prior mean.
         sigma: prior standard deviations; 0 for fixed intrinsics.
     """
 
     pose_jacobian: Float64[np.ndarray, "*rows 6 9"]
-    root: Float64[np.ndarray, "*rows 9 9"]
+    information_root: Float64[np.ndarray, "*rows 9 9"]
     residual: Float64[np.ndarray, "*rows 9"]
     intrinsics: Float64[np.ndarray, "*rows 9"]
-    stated: Float64[np.ndarray, "*rows 9"]
+    prior_mean: Float64[np.ndarray, "*rows 9"]
     sigma: Float64[np.ndarray, "*rows 9"]
 
     def select(self, rows: Bool[np.ndarray, " rows"]) -> "ImageIntrinsics":
@@ -101,10 +102,10 @@ def intrinsics_information(
     sigma, at = images.sigma[0], images.intrinsics[0]
     free = np.flatnonzero(sigma > 0)
     # in units of the prior standard deviations, in which the information of the prior is the identity
-    scaled = images.root[:, :, free] * sigma[free]
+    scaled = images.information_root[:, :, free] * sigma[free]
     information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
-    residual = images.residual + np.einsum("nij,nj->ni", images.root, images.intrinsics - at)
-    pull = np.einsum("nij,ni->j", scaled, residual) + (images.stated[0] - at)[free] / sigma[free]
+    residual = images.residual + np.einsum("nij,nj->ni", images.information_root, images.intrinsics - at)
+    pull = np.einsum("nij,ni->j", scaled, residual) + (images.prior_mean[0] - at)[free] / sigma[free]
     U, mean = np.zeros((NUMBERS, NUMBERS)), at.copy()
     U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
     mean[free] += sigma[free] * np.linalg.solve(information, pull)
@@ -173,7 +174,7 @@ def boards(measurements: Measurements) -> tuple[str, ...] | None:
     return names if any(names) else None
 
 
-def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
+def scale_sigmas(measurements: Measurements) -> Float64[Tensor, " boards"]:
     """Return the relative prior standard deviation of the scale of every board, 0 for fixed scales.
 
     A scale is fixed if no deviation is stated and no other row has a length that could determine the scale.
@@ -195,7 +196,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     Attributes:
         owner: index of the camera of every row, -1 in rows without a value.
-        root: noise times U [m per px or 1].
+        information_root: noise times U [m per px or 1].
         mean: combined estimate of k [px or 1].
         present: mask of the rows that have the value of a camera.
         sigma: the noise [m].
@@ -204,10 +205,10 @@ class IntrinsicsSensor(AbstractSensor):
     name = "intrinsics"
     unit = "m"
     components = NUMBERS
-    certain = True
+    is_stated = True
     determines_frame = False
     owner: Int64[Tensor, " rows"]
-    root: Float64[Tensor, "9 9 rows"]
+    information_root: Float64[Tensor, "9 9 rows"]
     mean: Float64[Tensor, "9 rows"]
     present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"]
@@ -234,7 +235,7 @@ class IntrinsicsSensor(AbstractSensor):
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the weighted errors of the intrinsics [m]."""
         error = self.mean[:, rows] - unknowns["camera"][:, self.owner[rows]]
-        residual: Tensor = torch.einsum("ijn,jn->in", self.root[..., rows], error)
+        residual: Tensor = torch.einsum("ijn,jn->in", self.information_root[..., rows], error)
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
@@ -245,7 +246,9 @@ class IntrinsicsSensor(AbstractSensor):
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
         """Return the derivatives of the values with respect to the intrinsics: the weights."""
-        return (UnknownDerivative("camera", self.owner[rows], self.root[..., rows].transpose(0, 1)),)
+        return (
+            UnknownDerivative("camera", self.owner[rows], self.information_root[..., rows].transpose(0, 1)),
+        )
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
@@ -266,7 +269,7 @@ class IntrinsicsSensor(AbstractSensor):
         images = ImageIntrinsics.from_csv_cells(texts_of(measurements, INTRINSICS_COLUMN))
         first = [names.index(name) for name in distinct_names(names)]
         return InitialUnknowns(
-            torch.from_numpy(images.stated[first]), torch.from_numpy(images.sigma[first] > 0)
+            torch.from_numpy(images.prior_mean[first]), torch.from_numpy(images.sigma[first] > 0)
         )
 
 
@@ -286,7 +289,7 @@ class BoardScaleSensor(AbstractSensor):
     name = "board scale"
     unit = "m"
     components = 1
-    certain = True
+    is_stated = True
     determines_frame = False
     owner: Int64[Tensor, " rows"]
     weight: Float64[Tensor, " rows"]
@@ -297,7 +300,7 @@ class BoardScaleSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "BoardScaleSensor | None":
         """Build the sensor with every board of free scale assigned to its first row; None if there is no such board."""
         data, names = rows.measurements, boards(rows.measurements)
-        deviations = scale_deviations(data)
+        deviations = scale_sigmas(data)
         if names is None or not bool((deviations > 0).any()) or not bool(rows.has_corner_poses.any()):
             return None
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
@@ -335,5 +338,5 @@ class BoardScaleSensor(AbstractSensor):
         """Return 0, the stated scale, for every board."""
         if boards(measurements) is None:
             return None
-        free = scale_deviations(measurements)[:, None] > 0
+        free = scale_sigmas(measurements)[:, None] > 0
         return InitialUnknowns(torch.zeros(free.shape, dtype=torch.float64), free)

@@ -71,7 +71,7 @@ class RotationSensor(AbstractSensor):
     name = "rotation"
     unit = "rad"
     components = 3
-    turning = True
+    depends_on_rotation = True
     measured: Float64[Tensor, "3 3 rows"]
     present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None

@@ -155,7 +155,7 @@ def measured_errors(
         residual = sensor.residual(motion, columns, slice(None)).t() * factor[:, None]
         error = torch.full_like(residual, torch.nan)
         error[rows[sensor.present]] = residual[sensor.present]
-        if sensor.paired:
+        if sensor.is_paired:
             error[rows[sensor.present.roll(1)]] = residual[sensor.present]
         errors[sensor.name] = error
     return errors

@@ -160,10 +160,10 @@ class AbstractSensor(ABC):
         name: name of the sensor, such as "position"; one noise level is estimated per name.
         unit: unit of the values.
         components: number of values per row.
-        turning: whether the predicted values depend on the tool's rotation.
-        certain: whether the values are stated rather than measured, so that their standard deviation is not estimated
+        depends_on_rotation: whether the predicted values depend on the tool's rotation.
+        is_stated: whether the values are stated rather than measured, so that their standard deviation is not estimated
             and they are never outliers.
-        paired: whether a value belongs to a row and the next one.
+        is_paired: whether a value belongs to a row and the next one.
         determines_frame: whether the values determine the position of the frame in which the sensor measures.
         readings: columns that the sensor adds to measurement files; None for a sensor whose values are fields of
             `Measurements`.
@@ -174,9 +174,9 @@ class AbstractSensor(ABC):
     name: ClassVar[str]
     unit: ClassVar[Literal["m", "rad"]]
     components: ClassVar[int]
-    turning: ClassVar[bool] = False
-    certain: ClassVar[bool] = False
-    paired: ClassVar[bool] = False
+    depends_on_rotation: ClassVar[bool] = False
+    is_stated: ClassVar[bool] = False
+    is_paired: ClassVar[bool] = False
     determines_frame: ClassVar[bool] = True
     readings: ClassVar[SensorReadings | None] = None
     present: Bool[Tensor, " rows"]
@@ -232,7 +232,7 @@ class AbstractSensor(ABC):
 
     @classmethod
     def uncalibrated_unknowns(
-        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated_owners: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the unknowns of an owner that was not calibrated, for the validation of its rows.
 
@@ -240,7 +240,7 @@ class AbstractSensor(ABC):
             measurements: rows that were not used for the calibration.
             owner: name of the owner, such as an anchor.
             T: poses of the tool according to a model, in the frame of every row.
-            calibrated: names of the owners that were calibrated.
+            calibrated_owners: names of the owners that were calibrated.
 
         Raises:
             IdentificationError: the rows do not determine the unknowns.
@@ -250,7 +250,7 @@ class AbstractSensor(ABC):
             f"'{owner}' of the sensor '{cls.name}' was not calibrated",
             at=measurements.place_of(row),
             value=owner,
-            remedy=nearest_choice(owner, calibrated),
+            remedy=nearest_choice(owner, calibrated_owners),
         )
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "AbstractSensor":

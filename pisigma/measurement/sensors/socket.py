@@ -112,7 +112,7 @@ class SocketSensor(AbstractSensor):
 
     @classmethod
     def uncalibrated_unknowns(
-        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated_owners: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the mean position of the rows of a socket, without outliers."""
         rows = indices_of_names(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
@@ -137,7 +137,7 @@ class SocketDistanceSensor(AbstractSensor):
     name = "socket distance"
     unit = "m"
     components = 1
-    certain = True
+    is_stated = True
     determines_frame = False
     first: Int64[Tensor, " rows"]
     second: Int64[Tensor, " rows"]

@@ -152,7 +152,7 @@ def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
     tensors = {"starts": model.starts, **hybrid_tensors(model)}
     if (rows := model.training_values) is not None:
         there = torch.isfinite(rows.numbers)
-        values = torch.where(there, rows.numbers, 0.0), there.to(torch.uint8), rows.steps
+        values = torch.where(there, rows.numbers, 0.0), there.to(torch.uint8), rows.rounding_steps
         tensors |= dict(zip(_ROWS, values, strict=True))
     for prefix, module in (("network", model.network), ("domain", model.domain)):
         if module is not None:

@@ -13,7 +13,7 @@ from safetensors.torch import save as save_tensors
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, WEIGHTS, read_model_file
 from pisigma.files.output_folder import staged_folder
-from pisigma.files.yaml_file import plain_content
+from pisigma.files.yaml_file import parse_plain_yaml
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.measurement.sensors.distance import ANCHOR_COLUMNS
@@ -103,7 +103,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
     """
     path = Path(folder)
     text = read_signed_text(path / DESCRIPTION)
-    before, document = stated_format(text), plain_content(text, ModelError, str(path / DESCRIPTION))
+    before, document = stated_format(text), parse_plain_yaml(text, ModelError, str(path / DESCRIPTION))
     if before is None or not isinstance(document, dict) or not isinstance(document.get("metrics"), dict):
         raise ModelError(
             expected="the description of a model",

@@ -178,7 +178,7 @@ def setup_sentence(
         reference: the nominal robot, or the planned model.
     """
     some = rows.select(used_rows) if used_rows.double().mean() > 1 - MIN_WRONG_SHARE else rows
-    found = check_rows(some, reference, may_move=MOVES).implausible
+    found = check_rows(some, reference, allowed_moves=MOVES).implausible_findings
     return found[0].sentence if found else ""
 
 

@@ -27,8 +27,8 @@ from pisigma.validation.report.accuracy import (
     AccuracyLimit,
     JudgedJoint,
     accuracies,
+    accuracy_limit,
     judged_joints,
-    limit_of,
 )
 from pisigma.validation.report.arm_in_images import ArmInImages
 from pisigma.validation.report.corrections import (
@@ -51,15 +51,16 @@ class Verdict:
     Attributes:
         sentence: accuracy of the model, improvement over nominal, place of the largest errors, and cause that limits
             the accuracy.
-        worst: sentence on the place of the largest errors.
-        limit: sentence on the cause that limits the accuracy: the first diagnosed cause, otherwise scatter or model.
+        worst_place: sentence on the place of the largest errors.
+        limiting_cause: sentence on the cause that limits the accuracy: the first diagnosed cause, otherwise scatter or
+            model.
         held_out: whether the sentence refers to rows that were not used to make the model.
         joint: the worst joint of a network, if no pose was evaluated.
     """
 
     sentence: str
-    worst: str
-    limit: str
+    worst_place: str
+    limiting_cause: str
     held_out: bool
     joint: JudgedJoint | None = None
 
@@ -134,7 +135,7 @@ def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
         f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
         for axis, low, high in zip("xyz", region.low, region.high, strict=True)
     )
-    clause, sentence = say("worst_region", region, where, largest.unit, rows.origin)
+    clause, sentence = say("worst_region", region, where, largest.unit, rows.row_origin)
     return clause, f"{sentence} {row}"
 
 
@@ -197,11 +198,11 @@ class ReportContent:
             "model": self.model.name,
             "verdict": self.verdict.sentence,
             "held_out": self.verdict.held_out,
-            "worst": self.verdict.worst,
+            "worst": self.verdict.worst_place,
             "limit": {
-                "noise_rms_mm": self.limit.noise,
+                "noise_rms_mm": self.limit.scatter,
                 "share": self.limit.scatter_share,
-                "summary": self.verdict.limit if self.accuracies else say("limit", self.limit)[0],
+                "summary": self.verdict.limiting_cause if self.accuracies else say("limit", self.limit)[0],
             },
             "accuracy": [
                 {
@@ -215,12 +216,12 @@ class ReportContent:
             ],
             "rows": None
             if rows is None
-            else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(self.remarks)},
+            else {"count": rows.measurements.rows, "origin": rows.row_origin, "remarks": list(self.remarks)},
             "residuals": [
                 {"variable": one.title, "summary": dependence_text(one)} for one in self.dependences
             ],
-            "frames": [asdict(one) for one in self.frames.names],
-            "targets": [asdict(one) for one in self.targets.names],
+            "frames": [asdict(one) for one in self.frames.name_errors],
+            "targets": [asdict(one) for one in self.targets.name_errors],
             "not_identified": list(self.not_identified),
             "observability": {} if self.summary is None else asdict(self.summary.observability),
             "correlated": [list(pair) for pair in self.correlations.pairs],
@@ -264,7 +265,7 @@ def report_content(
     if rows is not None:
         remarks = (*(one.sentence for one in diagnostics), *remarks, *say("remarks_on_rows", rows))
     figures, joints = accuracies(model, summary, rows), judged_joints(model)
-    limit = limit_of(model, summary, figures[0] if figures else None, rows)
+    limit = accuracy_limit(model, summary, figures[0] if figures else None, rows)
     correlations = parameter_correlations(folder)
     return ReportContent(
         model=model,

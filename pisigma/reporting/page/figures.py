@@ -90,9 +90,9 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
         for low, high in _stretches(curve.values, curve.measured):
             axes.axvspan(low, high, color="0.92", linewidth=0)
         dots = axes.plot(
-            curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3, label="_rows"
+            curve.row_values, curve.row_corrections, ".", color=OTHER, alpha=0.5, markersize=3, label="_rows"
         )
-        dots[0].set_rasterized(len(curve.dots) > _MANY_DOTS)
+        dots[0].set_rasterized(len(curve.row_corrections) > _MANY_DOTS)
         for where, line, label in (
             (curve.measured, "-", "_measured"),
             (~curve.measured, "--", "_extrapolated"),
@@ -150,14 +150,14 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
 
 
 def draw_map(
-    key: str, title: str, what: str, position: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
+    key: str, title: str, subject: str, position: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
 ) -> Drawing:
     """Draw quantities at points in space from above and from the side, for printing and without JavaScript.
 
     Args:
         key: key of the drawing.
         title: title of the drawing.
-        what: subject of the drawing, at the start of its text alternative.
+        subject: subject of the drawing, at the start of its text alternative.
         position: position of every point [mm].
         layers: quantities, drawn side by side.
     """
@@ -180,7 +180,7 @@ def draw_map(
             grid[0, column].set_title(f"{LAYER_LABELS[layer.key]}, largest {top:.3g} {layer.unit}")
             bar = figure.colorbar(dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g")
             bar.set_label(layer.unit)
-    return Drawing(key, title, f"{what} from above and from the side.", figure)
+    return Drawing(key, title, f"{subject} from above and from the side.", figure)
 
 
 def make_panel() -> tuple[Figure, Axes]:

@@ -29,7 +29,7 @@ def images_page(
     title: str,
     detection: DetectedBoards,
     tables: Sequence[tuple[str, Table]],
-    texts: tuple[Sequence[str], Sequence[str]],
+    sentences_and_warnings: tuple[Sequence[str], Sequence[str]],
 ) -> str:
     """Render the page of images as HTML; texts are escaped.
 
@@ -37,9 +37,9 @@ def images_page(
         title: title of the page.
         detection: boards in the images.
         tables: tables with their titles.
-        texts: sentences of the result, and warnings.
+        sentences_and_warnings: sentences of the result, and warnings.
     """
-    sentences, warnings = texts
+    sentences, warnings = sentences_and_warnings
     scale = arrow_scale(detection)
     return html_page(
         "images.html.j2",
@@ -48,14 +48,14 @@ def images_page(
         warnings=warnings,
         tables=tables,
         scale=f"{scale:g}",
-        pictures=[draw_image(one, detection, scale) for one in detection.images if one.is_read],
+        pictures=[draw_image(one, detection, scale) for one in detection.images if one.is_readable],
     )
 
 
 def arrow_scale(detection: DetectedBoards) -> float:
     """Compute the magnification of residuals in all pictures: 1, 2 or 5 times a power of ten."""
     lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
-    width = next(one.size[0] for one in detection.images if one.is_read)
+    width = next(one.size[0] for one in detection.images if one.is_readable)
     largest = _ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
     power = 10.0 ** np.floor(np.log10(largest))
     return float(power * max(step for step in (1, 2, 5) if step * power <= largest))
@@ -91,7 +91,7 @@ def draw_image(image: BoardImage, detection: DetectedBoards, scale: float) -> Dr
         residual = detection.residuals.get(image.name)
         if residual is None:
             return Drawing(image.name, image.name, f"Left out: {detection.left_out[image.name]}.", figure)
-        u, v = detection.predicted[image.name].T
+        u, v = detection.predicted_pixels[image.name].T
         axes.scatter(u, v, s=9, color=AFTER, linewidths=0)
         tips = residual * scale
         axes.quiver(u, v, *tips.T, color=BEFORE, angles="xy", scale_units="xy", scale=1.0, width=0.006)
@@ -128,7 +128,7 @@ def _picture(one: ArmInImage) -> Drawing:
         figure, axes = draw_photo(one.file, one.size)
         _draw(axes, one.nominal, NOMINAL, "--")
         _draw(axes, one.calibrated, CALIBRATED, "-")
-        axes.plot(*one.measured.T, ".", color=MEASURED, markersize=3)
+        axes.plot(*one.measured_corners.T, ".", color=MEASURED, markersize=3)
     alt = (
         f"The nominal arm (red, dashed) is {one.nominal_error * 1e3:.1f} mm off, the calibrated arm (green) "
         f"{one.calibrated_error * 1e3:.1f} mm; yellow dots are measured corners."
@@ -137,5 +137,5 @@ def _picture(one: ArmInImage) -> Drawing:
 
 
 def _draw(axes: Axes, arm: PredictedArm, color: str, style: str) -> None:
-    axes.plot(*arm.links.T, style, color=color, linewidth=2.0, marker="o", markersize=4)
-    axes.plot(*arm.corners.T, "o", color=color, markersize=4, fillstyle="none")
+    axes.plot(*arm.frame_pixels.T, style, color=color, linewidth=2.0, marker="o", markersize=4)
+    axes.plot(*arm.corner_pixels.T, "o", color=color, markersize=4, fillstyle="none")

@@ -29,7 +29,7 @@ from pisigma.reporting.lifetime_tables import chart_table, difference_table, ses
 from pisigma.reporting.page.drawing import AFTER, BEFORE, OTHER, Drawing, drawing_style
 from pisigma.reporting.page.figures import draw_map, make_panel
 from pisigma.reporting.page.page import html_page
-from pisigma.reporting.rendering import code
+from pisigma.reporting.rendering import markup_with_code
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
@@ -246,7 +246,14 @@ def _cells(status: FleetStatus, cells: Sequence[CellStatus], folder: Path) -> Ta
         linked = link.format(quote(Path(card).as_posix()), model) if model else ""
         command = Markup("<code>{}</code>").format(one.step.command) if one.step.command else ""
         rows.append(
-            (name, state.replace("_", " "), code(_sentence(one.step.reason)), command, linked, *others)
+            (
+                name,
+                state.replace("_", " "),
+                markup_with_code(_sentence(one.step.reason)),
+                command,
+                linked,
+                *others,
+            )
         )
     columns = (
         "cell",
@@ -266,7 +273,7 @@ def comparison_page(
     parameters: ParameterDifferences,
     displacements: Mapping[str, Displacement],
     rows: ModelComparison | None,
-    texts: tuple[Sequence[str], Sequence[str]],
+    sentences_and_warnings: tuple[Sequence[str], Sequence[str]],
 ) -> str:
     """Render a comparison of two models as HTML; texts are escaped.
 
@@ -275,10 +282,10 @@ def comparison_page(
         parameters: differences of the parameters.
         displacements: displacements of the tool, by description of the poses.
         rows: errors of both models on rows; None if none were given.
-        texts: sentences of the result, and warnings.
+        sentences_and_warnings: sentences of the result, and warnings.
     """
     first, second = models
-    sentences, warnings = texts
+    sentences, warnings = sentences_and_warnings
     return html_page(
         "comparison.html.j2",
         names=(first, second),
@@ -295,18 +302,22 @@ def comparison_page(
     )
 
 
-def draw_displacement(what: str, displacement: Displacement) -> Drawing:
+def draw_displacement(pose_description: str, displacement: Displacement) -> Drawing:
     """Draw distances between the poses of two models from above and from the side.
 
     Args:
-        what: description of the poses.
+        pose_description: description of the poses.
         displacement: displacement of the tool at the poses.
     """
     errors = displacement.errors
     layers = [Layer("distance", "mm", errors.position.numpy() * 1e3)]
     if errors.rotation is not None:
         layers.append(Layer("turn", "deg", np.rad2deg(errors.rotation.numpy())))
-    seen = f"Distance and rotation between the poses of both models, {what},"
+    seen = f"Distance and rotation between the poses of both models, {pose_description},"
     return draw_map(
-        f"displacement_{what}", _sentence(what), seen, displacement.position.numpy() * 1e3, layers
+        f"displacement_{pose_description}",
+        _sentence(pose_description),
+        seen,
+        displacement.position.numpy() * 1e3,
+        layers,
     )

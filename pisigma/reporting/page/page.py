@@ -121,7 +121,7 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
         "frame": _packed(numbers_of_names(error_map.frame)),
         "targets": list(dict.fromkeys(error_map.target)),
         "target": _packed(numbers_of_names(error_map.target)),
-        "inside": _packed(error_map.inside),
+        "inside": _packed(error_map.is_inside_range),
     }
 
 

@@ -76,7 +76,7 @@ def map_text(error_map: ErrorMap) -> str:
 
 def layer_text(layer: Layer, error_map: ErrorMap) -> str:
     """Return a text on the values of a layer of an error map."""
-    return say("layer", layer.key, error_map.origin)[0]
+    return say("layer", layer.key, error_map.row_origin)[0]
 
 
 def curve_text(curve: CorrectionCurve) -> str:
@@ -89,7 +89,7 @@ def zeros_table(arm: ArmInImages) -> Table:
     rows = [
         (one.joint, "", "", "not found: base and tool have the same effect")
         if one.standard_error is None
-        else (one.joint, f"{one.error:+.2f}", f"{one.standard_error:.2f}", "found")
+        else (one.joint, f"{one.zero_shift:+.2f}", f"{one.standard_error:.2f}", "found")
         for one in arm.zeros
     ]
     return Table(("joint", "error of the zero [deg]", "std. error [deg]", "remark"), tuple(rows))
@@ -203,7 +203,7 @@ def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
     """Return sentences on the payload and the temperature for which the figures are valid."""
-    if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
+    if rows is None or (rows.row_origin == "held_out" and rows.measurements.position is None):
         return []
     lines: list[str] = []
     for values, name, unit, little in (

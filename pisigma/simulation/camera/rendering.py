@@ -59,7 +59,7 @@ class TrueBoard:
     def pattern(self) -> Pattern:
         """Printed pattern of the board at its true size."""
         stated = board_pattern(self.described_board)
-        return Pattern(self.scale * stated.black, self.scale * stated.sheet)
+        return Pattern(self.scale * stated.black_rectangles, self.scale * stated.sheet_rectangle)
 
     def height(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
         """Return z of the surface [m] at points of the plane [m]."""
@@ -165,7 +165,7 @@ def _bounds(
     camera: Camera, board: TrueBoard, T_camera_board: np.ndarray, exposure: Exposure
 ) -> tuple[int, int, int, int]:
     """Return the range of pixels that the blurred board covers, or the whole image if the board leaves the view."""
-    left, top, right, bottom = board.pattern.sheet
+    left, top, right, bottom = board.pattern.sheet_rectangle
     along = np.linspace(0, 1, _OUTLINE)
     x, y = left + along * (right - left), top + along * (bottom - top)
     edges = [(x, np.full_like(x, end)) for end in (top, bottom)]
@@ -258,7 +258,7 @@ class _Surface:
     @staticmethod
     def from_pattern(pattern: Pattern, exposure: Exposure) -> "_Surface":
         """Return the grid of a sheet with a printed pattern."""
-        rectangles = np.concatenate([pattern.sheet[None], pattern.black])
+        rectangles = np.concatenate([pattern.sheet_rectangle[None], pattern.black_rectangles])
         x, y = np.unique(rectangles[:, [0, 2]]), np.unique(rectangles[:, [1, 3]])
         columns, rows = np.searchsorted(x, rectangles[:, [0, 2]]), np.searchsorted(y, rectangles[:, [1, 3]])
         gray = np.full((len(y) + 1, len(x) + 1), exposure.background)

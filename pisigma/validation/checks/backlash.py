@@ -24,12 +24,12 @@ class LostMotion:
     """Backlash of joints whose last motions are known from the order of the rows.
 
     Attributes:
-        play: backlash of the joints by their index [rad or m].
+        joint_backlash: backlash of the joints by their index [rad or m].
         error_ratio: ratio of the errors of the rows without and with the backlash in the model [1].
         log_bayes_factor: logarithm of the odds of backlash in these joints against none.
     """
 
-    play: dict[int, float]
+    joint_backlash: dict[int, float]
     error_ratio: float
     log_bayes_factor: float
 
@@ -52,22 +52,22 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
         return None
     assert measurements.approach is not None
     rows = rows.with_own_noise
-    approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.number]
+    approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.row_index]
     moved = (rows.joint_derivative * approach[:, None]).reshape(-1, approach.shape[1])
     free = rows.without_parameters(moved)
     possible = np.flatnonzero((free**2).sum(0) > 1e-12 * (moved**2).sum(0)).tolist()
     best = None
     for count in range(1, len(possible) + 1):
-        earlier = () if best is None else tuple(best.play)
+        earlier = () if best is None else tuple(best.joint_backlash)
         found = []
         for joint in possible:
             if joint in earlier:
                 continue
             joints = (*earlier, joint)
             effect = rows.evidence_of(free[:, joints])
-            play = dict(zip(joints, (2 * np.abs(effect.sizes)).tolist(), strict=True))
+            play = dict(zip(joints, (2 * np.abs(effect.effect_sizes)).tolist(), strict=True))
             choice = math.log(math.comb(len(possible), count))
-            found.append(LostMotion(play, effect.factor, effect.log_bayes_factor - choice))
+            found.append(LostMotion(play, effect.error_ratio, effect.log_bayes_factor - choice))
         better = max(found, key=lambda one: one.log_bayes_factor, default=None)
         if better is None or (best is not None and better.log_bayes_factor <= best.log_bayes_factor):
             break
@@ -78,14 +78,14 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
 def with_sides_of_order(
     calibrator: GeometricCalibrator,
     rows: Measurements,
-    calibrated: Callable[[Measurements], Measurements] = lambda rows: rows,
+    select_rows: Callable[[Measurements], Measurements] = lambda rows: rows,
 ) -> tuple[Measurements, tuple[Diagnostic, ...]]:
     """State the directions of the last motions in rows without directions of approach, if these matter.
 
     Args:
         calibrator: a geometric calibrator of the robot.
         rows: all rows of the files, because the last motion follows from the preceding row.
-        calibrated: function that selects the rows that decide whether the directions matter.
+        select_rows: function that selects the rows that decide whether the directions matter.
 
     Returns:
         The rows, and the finding of `unstated_backlash`; without a finding, the unchanged rows and None.
@@ -93,7 +93,7 @@ def with_sides_of_order(
     if rows.approach is not None:
         return rows, ()
     sided = replace(rows, approach=approach_by_order(rows))
-    found = unstated_backlash(calibrator, calibrated(sided))
+    found = unstated_backlash(calibrator, select_rows(sided))
     return (rows, ()) if found is None else (sided, (found,))
 
 
@@ -129,8 +129,8 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
 def _diagnostic(result: CalibrationResult, rows: Measurements, found: LostMotion) -> Diagnostic:
     """Name the joints with backlash, its size, and what it means for commanded poses of the fitted tools."""
     robot = result.robot
-    joints = tuple(sorted(found.play))
-    play = [found.play[joint] for joint in joints]
+    joints = tuple(sorted(found.joint_backlash))
+    play = [found.joint_backlash[joint] for joint in joints]
     per_unit = [(180 / math.pi, "deg") if robot.revolute[joint] else (1e3, "mm") for joint in joints]
     sizes = [(size * factor, unit) for size, (factor, unit) in zip(play, per_unit, strict=True)]
     tools = [robot.with_geometry(tool=tool) for tool in result.tools.values()]

@@ -95,7 +95,7 @@ def _largest_share(branch: Tensor) -> float:
 def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
     """Warn about intrinsics that are fixed, free, or far from their calibration."""
     identified = ImageIntrinsics.from_csv_cells(texts_of(images, INTRINSICS_COLUMN))
-    cells = zip(texts_of(images, CAMERA_COLUMN), identified.stated, identified.sigma, strict=True)
+    cells = zip(texts_of(images, CAMERA_COLUMN), identified.prior_mean, identified.sigma, strict=True)
     first = {camera: (stated, sigma) for camera, stated, sigma in reversed(list(cells)) if camera}
     for camera, (stated, sigma) in sorted(first.items()):
         if not sigma.any():

@@ -117,14 +117,14 @@ class RowsUnderModel:
         model: the model.
         rows: the rows.
         fitted: frames and tools that are known to have moved and are therefore fitted to the rows.
-        may_move: what else may have moved without this being a fault, such as "joint_zero".
+        allowed_moves: what else may have moved without this being a fault, such as "joint_zero".
         nominal: the nominal robot with base and tool fitted; used only to report its errors after a correction.
     """
 
     model: CalibratedModel
     rows: Measurements
     fitted: tuple[FrameKind, ...]
-    may_move: frozenset[Move]
+    allowed_moves: frozenset[Move]
     nominal: CalibratedModel | None = None
 
     @staticmethod
@@ -132,7 +132,7 @@ class RowsUnderModel:
         model: CalibratedModel,
         rows: Measurements,
         fitted: Collection[FrameKind],
-        may_move: Collection[Move],
+        allowed_moves: Collection[Move],
         nominal: CalibratedModel | None = None,
     ) -> "RowsUnderModel | None":
         """Return the rows with a measured and a predicted position; None if there are too few.
@@ -148,7 +148,7 @@ class RowsUnderModel:
         if int(there.sum()) < MIN_POSITION_ROWS:
             return None
         some = replace(some.select(there), pair=None, distance=None)
-        return RowsUnderModel(model, some, kinds, frozenset(may_move), nominal)
+        return RowsUnderModel(model, some, kinds, frozenset(allowed_moves), nominal)
 
     @cached_property
     def renamed_rows(self) -> Measurements:
@@ -160,12 +160,14 @@ class RowsUnderModel:
         """Predicted poses before anything is fitted."""
         return poses_of_rows(self.model, self.renamed_rows)
 
-    def zero_columns(
-        self, zeros: Float64[Tensor, " dof"] | None = None
+    def poses_with_moved_zeros(
+        self, zero_shifts: Float64[Tensor, " dof"] | None = None
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
         """Return poses predicted with moved joint zeros [rad or m], and their derivatives from finite differences."""
-        zeros = torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zeros is None else zeros
-        moved = [zeros, *(zeros + _STEP * torch.eye(self.renamed_rows.dof).double())]
+        zero_shifts = (
+            torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zero_shifts is None else zero_shifts
+        )
+        moved = [zero_shifts, *(zero_shifts + _STEP * torch.eye(self.renamed_rows.dof).double())]
         here, *there = (
             poses_of_rows(
                 self.model,
@@ -204,7 +206,7 @@ class RowsUnderModel:
         return result
 
     @cached_property
-    def predicted_deviation(self) -> Float64[Tensor, " rows"]:
+    def predicted_sigma(self) -> Float64[Tensor, " rows"]:
         """Predicted standard deviation of every row's error [m], including noise; NaN if the model has none."""
         deviation = sigma_of_rows(self.model, self.renamed_rows).square().sum(-1)
         known = self.model.uncertainty
@@ -233,7 +235,7 @@ class RowsUnderModel:
 
     def is_allowed_motion(self, fault: SetupFault) -> bool:
         """Return whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
-        return self.may_move.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
+        return self.allowed_moves.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
 
 
 Check = Callable[[CheckedCalibration], Iterator[Diagnostic]]

@@ -59,30 +59,30 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     are mixed, or it is unknown which rows are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to
     all rows first.
     """
-    if not bool(torch.isfinite(judged.predicted_deviation).all()):
+    if not bool(torch.isfinite(judged.predicted_sigma).all()):
         return
     found = [one for one in (_apart(judged, T) for T in _agreements(judged)) if one is not None]
     if found and not _joints_explain(judged):
-        yield mixed_rows(judged, min(found, key=lambda far: int(far.sum())))
+        yield mixed_rows_diagnostic(judged, min(found, key=lambda far: int(far.sum())))
 
 
-def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
+def mixed_rows_diagnostic(judged: RowsUnderModel, wrong_rows: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report rows that do not agree with the others, what distinguishes them, and what explains them."""
-    found = too_many_wrong_rows(judged.rows, wrong)
-    sentence = f"{found.sentence.removesuffix(_ADVICE)}{_cause(judged, wrong)}{_ADVICE}"
+    found = too_many_wrong_rows_diagnostic(judged.rows, wrong_rows)
+    sentence = f"{found.sentence.removesuffix(_ADVICE)}{_cause(judged, wrong_rows)}{_ADVICE}"
     return found.model_copy(update={"sentence": sentence})
 
 
-def too_many_wrong_rows(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
+def too_many_wrong_rows_diagnostic(rows: Measurements, wrong_rows: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report that more rows are wrong than can be left out."""
-    distinction = distinguishing_property(rows, wrong)
+    distinction = distinguishing_property(rows, wrong_rows)
     return Diagnostic(
         kind="mixed_rows",
         severity="implausible",
-        sentence=f"{int(wrong.sum())} of {rows.rows} rows do not agree with the others: "
+        sentence=f"{int(wrong_rows.sum())} of {rows.rows} rows do not agree with the others: "
         f"{distinction.clause}.{_ADVICE}",
-        rows=tuple(rows.place(row) for row in wrong.nonzero()[:, 0].tolist()),
-        values={"distinguished_by": distinction.by},
+        rows=tuple(rows.place(row) for row in wrong_rows.nonzero()[:, 0].tolist()),
+        values={"distinguished_by": distinction.kind},
         remedy=_ADVICE.strip(),
     )
 
@@ -93,7 +93,7 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
     if not faults:
         return ""
     fault = combine_alternatives(faults)
-    fall = join_words(length_text(error) for error in (fault.before, fault.after))
+    fall = join_words(length_text(error) for error in (fault.rms_before, fault.rms_after))
     return f" In these rows, {fault.clause} (errors without and with this correction: {fall})."
 
 
@@ -103,7 +103,7 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
         yield judged.poses_before_fit
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
         return
-    limit = AGREES * judged.predicted_deviation
+    limit = AGREES * judged.predicted_sigma
     samples = list(_samples(judged.rows.rows))
 
     @functools.lru_cache(maxsize=16)  # most samples soon lead to the same agreeing rows
@@ -144,7 +144,7 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
     """Return the mask of rows that are far from the agreeing rows; None if they are few or not clearly apart."""
-    ratio = judged.error_lengths(T) / (AGREES * judged.predicted_deviation)
+    ratio = judged.error_lengths(T) / (AGREES * judged.predicted_sigma)
     near, far = ratio <= 1, ratio > _APART
     count = judged.rows.rows
     if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= _MIN_AGREEING_SHARE * count:
@@ -157,10 +157,10 @@ def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tenso
 def _joints_explain(judged: RowsUnderModel) -> bool:
     """Return whether moved joint zeros explain all rows (linearised at the fitted poses)."""
     error = judged.measured.position - judged.predicted[:, :3, 3]
-    J = judged.zero_columns()[1][..., :3, 3].flatten(1).t()
+    J = judged.poses_with_moved_zeros()[1][..., :3, 3].flatten(1).t()
     solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
     left = (error.flatten() - J @ solution).view(-1, 3).norm(dim=-1)
-    return float((left / judged.predicted_deviation).square().mean().sqrt()) <= _EXPLAINED
+    return float((left / judged.predicted_sigma).square().mean().sqrt()) <= _EXPLAINED
 
 
 _CERTAIN = 30.0
@@ -192,7 +192,7 @@ def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         found = None if ordered is None else find_populations(ordered, checked.rows.rows)
         if found is None or not _differ(found):
             continue
-        if result is learned or learned is None or found.factor > _factor_of_hybrid(checked):
+        if result is learned or learned is None or found.error_ratio > _factor_of_hybrid(checked):
             yield _two_populations(checked.rows, found)
             return
     yield from _two_sizes(checked)
@@ -236,15 +236,15 @@ def _differ(found: Populations) -> bool:
     """Return whether the rows are two populations rather than one arm with unmodelled errors."""
     return (
         found.log_bayes_factor > _CERTAIN
-        and found.factor
+        and found.error_ratio
         > _LARGE[found.differing_part] * max((1 - _HARDLY_USED) / (1 - found.absorbed_share), 1.0)
-        and int(found.second.sum()) >= MIN_SHARE * found.evaluated_rows
+        and int(found.in_smaller_population.sum()) >= MIN_SHARE * found.evaluated_rows
     )
 
 
 def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
     """Report the rows of the smaller population and how they differ from the others."""
-    second = torch.from_numpy(found.second)
+    second = torch.from_numpy(found.in_smaller_population)
     distinction = distinguishing_property(rows, second)
     size, moved = int(second.sum()), f"{length_text(math.hypot(*found.difference[:3]))}"
     difference, advice = {
@@ -258,19 +258,19 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
             "Name another frame in these rows (column 'frame'), or leave them out",
         ),
     }[found.differing_part]
-    implausible = found.differing_part == "arm" or found.factor > _IMPLAUSIBLE
+    implausible = found.differing_part == "arm" or found.error_ratio > _IMPLAUSIBLE
     return Diagnostic(
         kind="two_populations",
         severity="implausible" if implausible else "warning",
         sentence=f"Two populations are mixed: {size} of {found.evaluated_rows} rows {difference} "
-        f"({distinction.clause}); the errors of all rows together are {found.factor:.2g} times as large as "
+        f"({distinction.clause}); the errors of all rows together are {found.error_ratio:.2g} times as large as "
         f"separately. {advice}.",
         rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
         cause=found.differing_part,
         values={
-            "factor": found.factor,
+            "factor": found.error_ratio,
             "log_odds": found.log_bayes_factor,
-            "distinguished_by": distinction.by,
+            "distinguished_by": distinction.kind,
         },
         remedy=f"{advice}.",
     )
@@ -284,19 +284,19 @@ class Distinction(NamedTuple):
     """A property that distinguishes some rows from the others.
 
     Attributes:
-        by: "name", "range" (of the file), "period" (every n-th row), "value", or "nothing" if the rows are scattered.
+        kind: "name", "range" (of the file), "period" (every n-th row), "value", or "nothing" if the rows are scattered.
         clause: the property in words, such as "all rows after rows.csv, line 8".
     """
 
-    by: Literal["name", "range", "period", "value", "nothing"]
+    kind: Literal["name", "range", "period", "value", "nothing"]
     clause: str
 
 
-def distinguishing_property(rows: Measurements, some: Bool[Tensor, " rows"]) -> Distinction:
+def distinguishing_property(rows: Measurements, selected: Bool[Tensor, " rows"]) -> Distinction:
     """Return a property that the given rows have and all others do not."""
-    for distinction in (*_by_name(rows, some), *_by_order(rows, some), *_by_value(rows, some)):
+    for distinction in (*_by_name(rows, selected), *_by_order(rows, selected), *_by_value(rows, selected)):
         return distinction
-    numbers = some.nonzero()[:, 0].tolist()
+    numbers = selected.nonzero()[:, 0].tolist()
     listed = join_words(rows.place(number) for number in numbers[:_MAX_PLACES])
     more = f" and {len(numbers) - _MAX_PLACES} more" if len(numbers) > _MAX_PLACES else ""
     return Distinction("nothing", f"{listed}{more}, which are scattered among the others")

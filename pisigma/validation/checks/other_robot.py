@@ -13,7 +13,7 @@ from pisigma.robot.robot_file import catalogue
 from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.trained_calibrations import base_and_tool
+from pisigma.validation.held_out.trained_calibrations import base_and_tool_calibrator
 
 _SUSPICIOUS = 0.01
 """Errors of the nominal robot, as a share of its reach, above which other robots are tried, and up to which another
@@ -66,7 +66,7 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
     if rows.rows < _MIN_ROWS:
         return ()
     try:
-        nominal = base_and_tool(calibrator).fit(rows)
+        nominal = base_and_tool_calibrator(calibrator).fit(rows)
     except IdentificationError:
         return ()
     checked = CheckedCalibration(calibrator, rows, {"nominal": nominal, "geometric": nominal})
@@ -81,7 +81,7 @@ def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
     chosen = torch.linspace(0, count - 1, min(count, _MAX_ROWS)).round().long()
     rows = checked.rows.select(chosen)
     try:
-        fitted = base_and_tool(replace(checked.calibrator, robot=other)).fit(rows)
+        fitted = base_and_tool_calibrator(replace(checked.calibrator, robot=other)).fit(rows)
     except IdentificationError:
         return None
     return pose_errors_of(fitted, rows).figures.rms_mm

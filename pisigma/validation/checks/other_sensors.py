@@ -62,7 +62,7 @@ def diagnose_lengths(
     model: CalibratedModel,
     rows: Measurements,
     fitted: Collection[FrameKind],
-    may_move: Collection[Move],
+    allowed_moves: Collection[Move],
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
     """Report the causes of errors that are too large for wear, in rows without positions.
 
@@ -74,15 +74,17 @@ def diagnose_lengths(
         rows: rows without positions. Rows of an anchor with too few rows are not checked; touches and wires to
             stated points are not checked if the base may have moved, because they depend on the base.
         fitted: frames and tools that are known to have moved.
-        may_move: what else may have moved without this being a fault.
+        allowed_moves: what else may have moved without this being a fault.
 
     Returns:
         The findings that make the rows implausible, and the setup fault that explains them, which may be a motion.
     """
     kinds = kinds_to_fit(model, rows, fitted)
     free = {"tool"} & {*kinds}
-    moves = free | ({*may_move} - {"frame"})
-    if ("base" in kinds or "frame" in may_move) and (rows.touch is not None or rows.anchor_place is not None):
+    moves = free | ({*allowed_moves} - {"frame"})
+    if ("base" in kinds or "frame" in allowed_moves) and (
+        rows.touch is not None or rows.anchor_place is not None
+    ):
         return (), ()
     known, reach = with_known_names(model, rows, kinds), model.robot.reach
     limit = plausible_share(model.robot) * reach

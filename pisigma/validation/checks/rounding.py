@@ -37,12 +37,12 @@ class Rounding:
 
     Attributes:
         steps: rounding step of every joint [rad or m]; 0 for joints that are not rounded.
-        error: RMS position error caused by the rounding [m].
+        rms_error: RMS position error caused by the rounding [m].
         error_share: share of the rows' squared errors that is caused by rounding [1].
     """
 
     steps: tuple[float, ...]
-    error: float
+    rms_error: float
     error_share: float
 
 
@@ -58,10 +58,10 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             kind="rounding",
             severity="warning",
             sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-            f"causes position errors of {length_text(rounding.error)} RMS, {100 * rounding.error_share:.0f} % of the "
-            "squared errors of the rows; log them with more decimals.",
+            f"causes position errors of {length_text(rounding.rms_error)} RMS, {100 * rounding.error_share:.0f} % of "
+            "the squared errors of the rows; log them with more decimals.",
             cause="joint_values",
-            values={"error_mm": rounding.error * 1e3, "share": rounding.error_share},
+            values={"error_mm": rounding.rms_error * 1e3, "share": rounding.error_share},
         )
     step = (
         _common_step(checked.rows.position.cpu().numpy() * 1e3) if checked.rows.position is not None else 0.0
@@ -108,7 +108,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     made = rows.joint_derivative * steps / math.sqrt(12)
     # Residuals of a fit are too small, because the parameters absorbed part of the errors.
     left = rows.residual_after_fit * math.sqrt(
-        rows.values / max(rows.values - rows.effective_parameters, 1.0)
+        rows.value_count / max(rows.value_count - rows.effective_parameters, 1.0)
     )
     share = float(np.square(made).sum() / max(np.square(left).sum(), 1e-300))
     if not _MIN_SHARE < share < _MAX_SHARE or _gain(left, made) < _LIKELY:

@@ -52,18 +52,20 @@ def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         for motion in motions
         if motion
         and motion.log_bayes_factor > _LIKELY
-        and not (motion.begins_frame and motion.factor <= _LARGE)
+        and not (motion.begins_frame and motion.error_ratio <= _LARGE)
     ]
     if likely:
-        motion = max(likely, key=lambda motion: motion.factor)
-        certain = motion.log_bayes_factor > _CERTAIN and motion.factor > _LARGE
+        motion = max(likely, key=lambda motion: motion.error_ratio)
+        certain = motion.log_bayes_factor > _CERTAIN and motion.error_ratio > _LARGE
         what, remedy = _texts(motion, checked.rows)
         yield Diagnostic(
             kind="row_order",
             severity="implausible" if certain else "warning",
-            sentence=f"{what}; this makes the errors of the rows {motion.factor:.3g} times as large. {remedy}",
-            rows=() if motion.first is None else (checked.rows.place(int(motion.rows[motion.first])),),
-            cause=motion.moved,
+            sentence=f"{what}; this makes the errors of the rows {motion.error_ratio:.3g} times as large. {remedy}",
+            rows=()
+            if motion.first_row is None
+            else (checked.rows.place(int(motion.rows[motion.first_row])),),
+            cause=motion.kind,
             values=_values(motion, checked.rows),
             remedy=remedy,
         )
@@ -74,32 +76,32 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
         "name": motion.name,
         "shift_mm": math.hypot(*motion.shift) * 1e3,
         "turn_deg": math.degrees(motion.turn),
-        "factor": motion.factor,
+        "factor": motion.error_ratio,
         "log_odds": motion.log_bayes_factor,
     }
-    if motion.first is not None:
-        row = int(motion.rows[motion.first])
+    if motion.first_row is not None:
+        row = int(motion.rows[motion.first_row])
         values |= {"first_row": row, "first_line": rows.line[row]}
     return values
 
 
 def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
     """Return a text that states what moved, at which row and how far, and a text that states what to do."""
-    what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
-    what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
+    what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.kind]
+    what += f" '{motion.name}'" if motion.name and motion.kind != "tool" else ""
     x, y, z = motion.shift * 1e3
     amount = f"{length_text(math.hypot(*motion.shift))} (x {x:.3g}, y {y:.3g}, z {z:.3g} mm "
-    amount += "in its axes)" if motion.moved == "frame" else "in the flange's axes)"
+    amount += "in its axes)" if motion.kind == "frame" else "in the flange's axes)"
     amount += f" and {math.degrees(motion.turn):.2g} deg" if motion.turn > 0 else ""
-    if motion.first is None:
+    if motion.first_row is None:
         return (
             f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}",
             "Let the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at "
             "several lines (--set new_frame_at=LINE).",
         )
-    row = int(motion.rows[motion.first])
+    row = int(motion.rows[motion.first_row])
     naming = "name another target in them (column 'target')"
-    if motion.moved == "frame":
+    if motion.kind == "frame":
         naming = f"give them another frame (--set new_frame_at={rows.line[row] or 'LINE'})"
     return (
         f"{rows.place(row)}: the {what} moved before this row by {amount}",

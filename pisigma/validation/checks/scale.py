@@ -181,7 +181,7 @@ _MIN_DEVIATIONS = 5.0
 
 def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit a factor on the measured positions together with base and tool, and compare it with moved joint zeros."""
-    usual = float(judged.predicted_deviation.square().mean().sqrt())
+    usual = float(judged.predicted_sigma.square().mean().sqrt())
     single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
     if not single or 3 * judged.rows.rows < 2 * FITTED_PARAMETERS or not usual > 0:
         return
@@ -193,7 +193,7 @@ def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
         return
     position = (judged.measured.position - judged.measured.position.mean(0)).flatten()
     after, factor, deviation = _fit(torch.cat([_frames(T), position[:, None]], 1), error)
-    zeros = (base @ judged.zero_columns()[1] @ tool)[..., :3, 3].flatten(1)
+    zeros = (base @ judged.poses_with_moved_zeros()[1] @ tool)[..., :3, 3].flatten(1)
     others = (_fit(torch.cat([_frames(T), one[:, None]], 1), error)[0] for one in zeros)
     if (
         abs(factor) > max(_MIN_CHANGE, _MIN_DEVIATIONS * deviation)

@@ -55,7 +55,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
     """Return findings about setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
         fault = combine_alternatives(faults)
-        severity: Severity = "implausible" if fault.moved > largest_zero(robot) else "warning"
+        severity: Severity = "implausible" if fault.largest_zero_shift > largest_zero(robot) else "warning"
         return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
         return (
@@ -73,7 +73,7 @@ def check_setup_of_rows(rows: RowsUnderModel) -> Iterator[Diagnostic]:
     if rows.has_large_errors:
         faults = rows.setup_faults
     else:
-        faults = () if {"frame", "tool"} <= rows.may_move else rows.moved_frames
+        faults = () if {"frame", "tool"} <= rows.allowed_moves else rows.moved_frames
     if faults and not any(map(rows.is_allowed_motion, faults)):
         yield combine_alternatives(faults).diagnostic()
 
@@ -106,7 +106,7 @@ def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic
     )
 
 
-def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+def check_joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     """Try a reversed sign of every joint and a swap of two neighbouring joints, with base and tool fitted each time.
 
     With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.

@@ -30,7 +30,7 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     for sensor, part in zip(
         solved.problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
     ):
-        if sensor.sigma is None or sensor.certain or sensor.components not in _CHI_MEDIAN:
+        if sensor.sigma is None or sensor.is_stated or sensor.components not in _CHI_MEDIAN:
             continue
         distance = part.distance[sensor.present]
         ratio = float(distance.median()) / _CHI_MEDIAN[sensor.components]

@@ -83,10 +83,10 @@ def _left(judged: RowsUnderModel) -> float:
     largest = (
         MAX_STEP * torch.tensor([1.0 if revolute else robot.reach for revolute in robot.revolute]).double()
     )
-    moves = "joint_zero" in judged.may_move
+    moves = "joint_zero" in judged.allowed_moves
     least = float("inf")
     for _ in range(MAX_ITERATIONS if moves else 1):
-        T, derivative = judged.zero_columns(zeros)
+        T, derivative = judged.poses_with_moved_zeros(zeros)
         # Base and tool have a closed form for given zeros; a Gauss-Newton step of the zeros follows.
         base, tool = best_base_and_tool(T, judged.measured)
         error = judged.measured.position - (base @ T @ tool)[:, :3, 3]

@@ -39,12 +39,12 @@ class FilteredRows:
     Attributes:
         rows: the remaining rows; all rows if none is wrong.
         warnings: warnings about wrong rows and the sizes of their errors; empty if no row is wrong.
-        indices: indices of the wrong rows, from 0.
+        wrong_row_indices: indices of the wrong rows, from 0.
     """
 
     rows: Measurements
     warnings: tuple[str, ...] = ()
-    indices: tuple[int, ...] = ()
+    wrong_row_indices: tuple[int, ...] = ()
 
 
 def without_wrong_rows(

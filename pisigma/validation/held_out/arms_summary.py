@@ -133,19 +133,21 @@ class ArmsSummary(Section):
         return self.model_dump(mode="json")
 
 
-def base_figures(bases: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> ArmBaseFigures:
+def base_figures(
+    bases: ArmBases, first_arm: int, second_arm: int, postures: tuple[Postures, ...]
+) -> ArmBaseFigures:
     """Return the base of the second arm relative to that of the first; `postures` are those of every arm."""
-    T, covariance = bases.relative(first, second)
+    T, covariance = bases.relative(first_arm, second_arm)
     shown = np.array([1e3] * 3 + [math.degrees(1)] * 3)
     in_mm_and_deg = covariance.numpy() * shown * shown[:, None]
     names = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
     values = dict(zip(names, (xyzrpy_from_transform(T).numpy() * shown).tolist(), strict=True))
     return ArmBaseFigures(
-        arm=bases.arms[second].name,
-        in_base_of=bases.arms[first].name,
+        arm=bases.arms[second_arm].name,
+        in_base_of=bases.arms[first_arm].name,
         standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
         covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
-        tool_to_tool_mm=tool_to_tool_deviation(bases, first, second, postures) * 1e3,
+        tool_to_tool_mm=tool_to_tool_deviation(bases, first_arm, second_arm, postures) * 1e3,
         **values,
     )
 

@@ -211,7 +211,7 @@ class CalibrationSummary(AbstractSummary):
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
         predicted_rms_mm: predicted RMS error at other poses if no row was held out [mm]; see
-            `predicted_at_other_poses`.
+            `predicted_rms_at_other_poses`.
         held_out_rows: hashes of the file of held-out rows.
         learning_curve: errors of held-out rows by the number of training rows.
         redundant_sets: for recipes, sets of parameters that are redundant in pairs.

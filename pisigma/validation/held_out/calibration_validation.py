@@ -34,7 +34,7 @@ from pisigma.validation.held_out.trained_calibrations import (
     fit_compared_calibrations,
     geometric_of,
     judgeable_rows,
-    with_frames,
+    with_missing_frames,
 )
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
@@ -55,8 +55,8 @@ class CalibrationValidation:
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely; their errors are relative to the mean
             predicted position of the ball.
-        not_judged: number of held-out rows that could not be evaluated, because no training row has their target or
-            anchor.
+        rows_not_judged: number of held-out rows that could not be evaluated, because no training row has their target
+            or anchor.
         further_repeats: validations with other folds (repeats), whose errors are included in the figures.
     """
 
@@ -66,7 +66,7 @@ class CalibrationValidation:
     distances: DistanceErrors = field(default_factory=DistanceErrors)
     frames_fitted: int = 0
     sockets_held_out: int = 0
-    not_judged: int = 0
+    rows_not_judged: int = 0
     further_repeats: tuple["CalibrationValidation", ...] = ()
 
     @property
@@ -110,7 +110,7 @@ class CalibrationValidation:
         if (distances := distance_figures([one.distances for one in self.repeats])) is not None:
             figures["socket_distance"] = distances.model_dump(exclude_unset=True)
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
-        counts["rows_not_judged"] = max(repeat.not_judged for repeat in self.repeats)
+        counts["rows_not_judged"] = max(repeat.rows_not_judged for repeat in self.repeats)
         figures |= {name: count for name, count in counts.items() if count}
         if simulations:
             rms = {
@@ -127,22 +127,22 @@ class JudgedFold:
     """Result of one fold: errors of its held-out rows under all models.
 
     Attributes:
-        test: indices of the held-out rows.
+        test_rows: indices of the held-out rows.
         errors: their errors by model.
         distances: errors of stated distances between sockets that its calibration did not use.
         spread: position errors and their predicted standard deviations under the hybrid.
-        frames: number of frames that were held out completely.
-        sockets: number of sockets that were held out completely.
-        not_judged: number of held-out rows that could not be evaluated.
+        frames_fitted: number of frames that were held out completely.
+        sockets_held_out: number of sockets that were held out completely.
+        rows_not_judged: number of held-out rows that could not be evaluated.
     """
 
-    test: Int64[Tensor, " rows"]
+    test_rows: Int64[Tensor, " rows"]
     errors: Mapping[str, PoseErrors]
     distances: DistanceErrors
     spread: PredictedSpread | None
-    frames: int = 0
-    sockets: int = 0
-    not_judged: int = 0
+    frames_fitted: int = 0
+    sockets_held_out: int = 0
+    rows_not_judged: int = 0
 
 
 def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int) -> CalibrationValidation:
@@ -153,13 +153,14 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
     spread = None
     for fold in judged:
         for name, of_fold in fold.errors.items():
-            errors[name].set_rows(fold.test, of_fold)
+            errors[name].set_rows(fold.test_rows, of_fold)
         if fold.spread is not None:
             spread = spread or PredictedSpread.all_nan(measurements.rows)
-            spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
+            spread.error[fold.test_rows], spread.sigma[fold.test_rows] = fold.spread.error, fold.spread.sigma
     distances = DistanceErrors.concatenate([fold.distances for fold in judged])
     frames, sockets, not_judged = (
-        sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "not_judged")
+        sum(getattr(fold, count) for fold in judged)
+        for count in ("frames_fitted", "sockets_held_out", "rows_not_judged")
     )
     return CalibrationValidation(folds, errors, spread, distances, frames, sockets, not_judged)
 
@@ -232,10 +233,12 @@ def fold_tasks(
 
 
 def joined_repeats(
-    measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged: Iterator[JudgedFold]
+    measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged_folds: Iterator[JudgedFold]
 ) -> CalibrationValidation:
     """Combine the evaluated folds of all repeats, in the order of `fold_tasks`."""
-    first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
+    first, *again = [
+        _joined(measurements, [next(judged_folds) for _ in splits], len(splits)) for splits in repeats
+    ]
     return replace(first, further_repeats=tuple(again))
 
 
@@ -266,10 +269,10 @@ def _judged_fold(
     judged = _judge(geometric_of(calibrator), results, held_out, distances, everything)
     return replace(
         judged,
-        test=judged_rows,
-        frames=len(set(held_out.frame) - set(training.frame)),
-        sockets=len(_sockets(held_out) - _sockets(training)),
-        not_judged=len(test) - len(judged_rows),
+        test_rows=judged_rows,
+        frames_fitted=len(set(held_out.frame) - set(training.frame)),
+        sockets_held_out=len(_sockets(held_out) - _sockets(training)),
+        rows_not_judged=len(test) - len(judged_rows),
     )
 
 
@@ -277,7 +280,7 @@ def learning_curve(
     calibrator: Calibrator,
     measurements: Measurements,
     splits: Sequence[TrainTest],
-    sizes: Sequence[int],
+    row_counts: Sequence[int],
     seed: int,
     progress: Progress = lambda what: None,
     full_training: CalibrationValidation | None = None,
@@ -289,7 +292,7 @@ def learning_curve(
         calibrator: see `validate`.
         measurements: the rows.
         splits: training and test rows.
-        sizes: numbers of training rows.
+        row_counts: numbers of training rows.
         seed: random seed of the selection of training rows; smaller selections are subsets of larger ones.
         progress: called with the current step.
         full_training: validation with all training rows, as the last point of the curve; None to omit it.
@@ -303,7 +306,7 @@ def learning_curve(
         IdentificationError: a number of rows is too small to determine the parameters.
     """
     points = []
-    for rows in sorted(sizes):
+    for rows in sorted(row_counts):
         fewer = with_fewer_training_rows(measurements, splits, rows, seed)
         of_rows = with_stage(progress, f"{rows} training rows")
         points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
@@ -346,7 +349,9 @@ def _judge(
     Held-out distances between sockets are evaluated on all rows.
     """
     if calibrator is not None:
-        results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
+        results = {
+            name: with_missing_frames(calibrator, fitted, held_out) for name, fitted in results.items()
+        }
     errors = {name: pose_errors_of(result, held_out) for name, result in results.items()}
     hybrid = results.get("hybrid")
     spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None

@@ -35,14 +35,14 @@ class ContradictingRowFigures(Section):
 
 
 def contradicting_rows(
-    result: ErrorPredictor, rows: Measurements, wrong: Sequence[int]
+    result: ErrorPredictor, rows: Measurements, wrong_rows: Sequence[int]
 ) -> tuple[ContradictingRowFigures, ...]:
     """Return the figures of rows that were left out.
 
     Args:
         result: calibration with the other rows.
         rows: all rows.
-        wrong: indices of the rows that were left out.
+        wrong_rows: indices of the rows that were left out.
 
     Raises:
         IdentificationError: such a row has a frame, target or anchor that was not calibrated.
@@ -50,7 +50,7 @@ def contradicting_rows(
     errors = pose_errors_of(result, rows)
     sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
     figures = []
-    for row in wrong:
+    for row in wrong_rows:
         off = {
             name: float(those[row]) * factor
             for name, (those, factor) in sizes.items()

@@ -23,7 +23,7 @@ from pisigma.validation.held_out.calibration_validation import JudgedFold, fold_
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,
-    base_and_tool,
+    base_and_tool_calibrator,
     fit,
     geometric_of,
     geometric_result,
@@ -66,7 +66,7 @@ def fit_if_better(calibrator: Calibrator, rows: Measurements, progress: Progress
         geometric, geometric_result(result), rows, with_stage(progress, "few rows")
     ):
         return result
-    nominal = base_and_tool(geometric)
+    nominal = base_and_tool_calibrator(geometric)
     if isinstance(calibrator, HybridCalibrator):
         return fit(replace(calibrator, robot=nominal, features=(), products=False), rows, progress)
     return fit(nominal, rows, progress)
@@ -96,7 +96,7 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
 
     This is the F test of nested models, with the effective number of parameters under their prior.
     """
-    nominal = base_and_tool(calibrator).fit(rows).noise
+    nominal = base_and_tool_calibrator(calibrator).fit(rows).noise
     pairs = list(zip(result.noise, nominal, strict=True))
     left = sum(noise.values - noise.effective_parameters for noise, _ in pairs)
     more = sum(noise.effective_parameters - before.effective_parameters for noise, before in pairs)

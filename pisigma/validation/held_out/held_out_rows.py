@@ -89,7 +89,7 @@ class HeldOutRows:
         writer.writerows(zip(*columns.values(), strict=True))
         return text.getvalue()
 
-    def hashes(self, text: str) -> HeldOutFile:
+    def compute_hashes(self, text: str) -> HeldOutFile:
         """Compute the hashes of this text and its measurements, which the metrics of the model store."""
         return HeldOutFile(sha256=hashlib.sha256(text.encode()).hexdigest(), data_sha256=self.data_sha256)
 

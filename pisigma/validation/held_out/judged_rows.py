@@ -34,44 +34,44 @@ class JudgedRows:
     """Rows and their errors, in SI units.
 
     Attributes:
-        origin: "held_out": errors under calibrations without the row; "training": errors of training rows of the model;
-            "other": errors of other rows.
+        row_origin: "held_out": errors under calibrations without the row; "training": errors of training rows of the
+            model; "other": errors of other rows.
         measurements: the rows; only joint values and names for held-out rows that a model stores.
         position: position of the tool in the robot's base frame [m].
         models: errors of every row by model, "nominal" first and the model last.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
-        residual_origin: origin of the residuals, in the form of `origin`.
-        predicted: standard deviation of the predicted position [m]; NaN if there is none.
-        inside: whether every joint value is in the range measured for the model.
+        residual_origin: origin of the residuals, in the form of `row_origin`.
+        predicted_sigma: standard deviation of the predicted position [m]; NaN if there is none.
+        is_inside_range: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.
         repeated_row_warnings: warnings about duplicate rows and training rows of the model.
         nominal: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model that was not
             calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
-        unknown: number of rows without a position error.
+        rows_without_error: number of rows without a position error.
         repeats: number of repeats of the cross-validation; the errors are those of the first one.
     """
 
-    origin: str
+    row_origin: str
     measurements: Measurements
     position: Float64[Tensor, "rows 3"]
     models: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
     residual_origin: str
-    predicted: Float64[Tensor, " rows"]
-    inside: Bool[Tensor, " rows"]
+    predicted_sigma: Float64[Tensor, " rows"]
+    is_inside_range: Bool[Tensor, " rows"]
     left_out: int = 0
     repeated_row_warnings: tuple[str, ...] = ()
     nominal: Literal["fitted", "given", "model"] | None = None
-    unknown: int = 0
+    rows_without_error: int = 0
     repeats: int = 1
 
     @property
-    def before(self) -> PoseErrors:
+    def nominal_errors(self) -> PoseErrors:
         """Errors of the nominal robot."""
         return self.models["nominal"]
 
     @property
-    def after(self) -> PoseErrors:
+    def model_errors(self) -> PoseErrors:
         """Errors of the model."""
         return list(self.models.values())[-1]
 
@@ -138,7 +138,7 @@ def rows_of_file(
         left_out=left_out,
         repeated_row_warnings=(*copy_warnings(rows.left_out), *again),
         nominal="model" if not own_frames else "given" if model.calibrated is None else "fitted",
-        unknown=int((~torch.isfinite(errors.position)).sum()),
+        rows_without_error=int((~torch.isfinite(errors.position)).sum()),
     )
 
 
@@ -160,7 +160,7 @@ def tool_positions(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Fl
     return (invert(base) @ T)[:, :3, 3]
 
 
-def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, " rows"]:
+def predicted_position_sigma(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, " rows"]:
     """Compute standard deviations of predicted positions [m]; NaN if unknown, and beyond `MAX_PREDICTED` rows."""
     predicted = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
     chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MAX_PREDICTED)).round().long()
@@ -185,14 +185,14 @@ def _judged(
     origins: tuple[str, str],
 ) -> JudgedRows:
     return JudgedRows(
-        origin=origins[0],
+        row_origin=origins[0],
         measurements=replace(rows, source=rows.file_names),
         position=tool_positions(model, rows.q),
         models=models,
         residual=residual,
         residual_origin=origins[1],
-        predicted=predicted_at(model, rows),
-        inside=is_inside_range(model, rows.q),
+        predicted_sigma=predicted_position_sigma(model, rows),
+        is_inside_range=is_inside_range(model, rows.q),
     )
 
 

@@ -59,7 +59,7 @@ class ErrorVectors:
         return ErrorVectors(position, torch.where(there[:, None], rotation_vector(R), torch.nan))
 
     @property
-    def sizes(self) -> "PoseErrors":
+    def to_pose_errors(self) -> "PoseErrors":
         """Lengths and angles of the errors."""
         return PoseErrors(
             self.position.norm(dim=-1), None if self.rotation is None else self.rotation.norm(dim=-1)
@@ -82,7 +82,7 @@ class PoseErrors:
     @staticmethod
     def from_prediction(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
         """Compute the errors of measurements relative to predicted poses; see `ErrorVectors.from_prediction`."""
-        return ErrorVectors.from_prediction(measurements, expected).sizes
+        return ErrorVectors.from_prediction(measurements, expected).to_pose_errors
 
     @staticmethod
     def all_nan(rows: int, with_orientation: bool) -> "PoseErrors":
@@ -223,7 +223,7 @@ class PredictedSpread:
         )
 
     @property
-    def values(self) -> int:
+    def value_count(self) -> int:
         """Number of coordinates with an error and a predicted standard deviation."""
         return int(self._judged.sum())
 
@@ -235,7 +235,7 @@ class PredictedSpread:
 
     def in_file_units(self) -> dict[str, float]:
         """Return the coverage and the RMS predicted position error [mm]; empty if there are no rows."""
-        if not self.values:
+        if not self.value_count:
             return {}
         rows = self._judged.all(-1)
         sigma = float(self.sigma[rows].square().sum(-1).mean().sqrt()) * 1e3
@@ -272,7 +272,7 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     return spread
 
 
-def predicted_at_other_poses(
+def predicted_rms_at_other_poses(
     result: CalibrationResult | HybridResult, measurements: Measurements
 ) -> float | None:
     """Compute the RMS position error, including noise, that a calibration predicts at other poses [m].
@@ -307,7 +307,7 @@ def predicted_at_other_poses(
     return rms if math.isfinite(rms) else None
 
 
-def image_deviation(measurements: Measurements) -> float:
+def image_position_rms(measurements: Measurements) -> float:
     """Compute the RMS error of positions measured by single images [m]; 0 without images."""
     noise = measurements.readings.get(NOISE_COLUMN)
     if not isinstance(noise, Tensor):
@@ -318,7 +318,7 @@ def image_deviation(measurements: Measurements) -> float:
 
 def image_remark(measurements: Measurements) -> tuple[str, ...]:
     """Write a remark on the uncertainty of positions measured by images; empty without images."""
-    deviation = image_deviation(measurements)
+    deviation = image_position_rms(measurements)
     if not deviation:
         return ()
     return (

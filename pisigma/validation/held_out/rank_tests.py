@@ -25,7 +25,7 @@ def rank_correlation(
     return float(result.statistic), float(result.pvalue)
 
 
-def groups_differ(
+def kruskal_wallis(
     group: Int64[np.ndarray, " values"], values: Float64[np.ndarray, " values"]
 ) -> tuple[float, float]:
     """Test whether groups have values of different size (Kruskal and Wallis 1952).

@@ -8,7 +8,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
-from pisigma.validation.held_out.trained_calibrations import base_and_tool
+from pisigma.validation.held_out.trained_calibrations import base_and_tool_calibrator
 
 
 def nominal_model(model: CalibratedModel, with_orientation: bool) -> CalibratedModel:
@@ -28,7 +28,9 @@ def nominal_model(model: CalibratedModel, with_orientation: bool) -> CalibratedM
     if model.calibrated is None:
         return replace(model, network=None, domain=None)
     try:
-        fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, with_orientation))
+        fitted = base_and_tool_calibrator(GeometricCalibrator(model.robot)).fit(
+            _predicted(model, with_orientation)
+        )
     except IdentificationError as problem:
         raise ModelError(
             f"model '{model.name}': the base and tool of the nominal robot cannot be fitted to the "

@@ -74,13 +74,13 @@ def fit_compared_calibrations(
     Raises:
         IdentificationError: the rows do not determine the parameters.
     """
-    nominal = base_and_tool(geometric_of(calibrator)).fit(rows)
+    nominal = base_and_tool_calibrator(geometric_of(calibrator)).fit(rows)
     result = fit(calibrator, rows, progress) if result is None else result
     results: dict[str, Result] = {"nominal": nominal, "geometric": geometric_result(result)}
     return results | ({"hybrid": result} if isinstance(result, HybridResult) else {})
 
 
-def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
+def base_and_tool_calibrator(calibrator: GeometricCalibrator) -> GeometricCalibrator:
     """Return the calibrator of the nominal arm: only base and tool are fitted, and all rows have full weight."""
     return replace(calibrator, free=(), loss=SquaredLoss())
 
@@ -117,7 +117,7 @@ def drop_missing_frames(
     )
 
 
-def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
+def with_missing_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
     """Return a calibration with the bases of missing frames fitted to the rows in these frames.
 
     Args:
@@ -174,12 +174,12 @@ def _bases(
     return only_bases.fit(rows).bases
 
 
-def judgeable_rows(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
+def judgeable_rows(measurements: Measurements, test_indices: Tensor, training: Measurements) -> Tensor:
     """Return the mask of test rows whose target and anchor (unless stated) also occur in training rows.
 
     Args:
         measurements: all rows.
-        test: indices of the test rows.
+        test_indices: indices of the test rows.
         training: the training rows.
 
     Returns:
@@ -191,8 +191,12 @@ def judgeable_rows(measurements: Measurements, test: Tensor, training: Measureme
     targets, anchors = set(training.target), {*(training.anchor or ()), ""}
     names = measurements.anchor or ("",) * measurements.rows
     place = measurements.anchor_place
-    placed = torch.zeros(len(test), dtype=torch.bool) if place is None else place[test].isfinite().all(-1)
-    rows = test.tolist()
+    placed = (
+        torch.zeros(len(test_indices), dtype=torch.bool)
+        if place is None
+        else place[test_indices].isfinite().all(-1)
+    )
+    rows = test_indices.tolist()
     rows_judged = [
         measurements.target[row] in targets and (names[row] in anchors or is_placed)
         for row, is_placed in zip(rows, placed.tolist(), strict=True)
@@ -204,7 +208,7 @@ def judgeable_rows(measurements: Measurements, test: Tensor, training: Measureme
             at=measurements.place_of(rows[0]),
             remedy="measure more poses with each, or omit the cross-validation",
         )
-    return torch.tensor(rows_judged, device=test.device)
+    return torch.tensor(rows_judged, device=test_indices.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,17 +216,17 @@ class DistanceErrors:
     """Errors of stated distances between sockets.
 
     Attributes:
-        stated: stated distances by the names of two sockets [m].
+        stated_distances: stated distances by the names of two sockets [m].
         errors: predicted minus stated distances by model, in the same order [m].
     """
 
-    stated: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    stated_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     errors: Mapping[str, Float64[Tensor, " pairs"]] = field(default_factory=dict)
 
     @staticmethod
     def from_poses(
         poses: Mapping[str, Float64[Tensor, "rows 4 4"]],
-        stated: Mapping[PairOfSockets, float],
+        stated_distances: Mapping[PairOfSockets, float],
         rows: Measurements,
     ) -> "DistanceErrors":
         """Return the errors under several calibrations, with sockets at the mean predicted position of their balls.
@@ -230,25 +234,28 @@ class DistanceErrors:
         Args:
             poses: predicted poses of the target in every row, by name of a calibration that does not use these
                 distances.
-            stated: the distances [m].
+            stated_distances: the distances [m].
             rows: the rows, including those of the sockets.
         """
-        errors, sockets = {}, tuple({one for pair in stated for one in pair})
+        errors, sockets = {}, tuple({one for pair in stated_distances for one in pair})
         for model, T in poses.items():
             centre = {
                 name: SocketSensor.uncalibrated_unknowns(rows, name, T.detach().cpu(), ()) for name in sockets
             }
             errors[model] = torch.tensor(
-                [float((centre[a] - centre[b]).norm()) - distance for (a, b), distance in stated.items()],
+                [
+                    float((centre[a] - centre[b]).norm()) - distance
+                    for (a, b), distance in stated_distances.items()
+                ],
                 dtype=torch.float64,
             )
-        return DistanceErrors(stated, errors)
+        return DistanceErrors(stated_distances, errors)
 
     @staticmethod
     def concatenate(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
         """Concatenate the errors of several folds."""
-        there = [part for part in parts if part.stated]
-        stated = {pair: distance for part in there for pair, distance in part.stated.items()}
+        there = [part for part in parts if part.stated_distances]
+        stated = {pair: distance for part in there for pair, distance in part.stated_distances.items()}
         names = there[0].errors if there else ()
         return DistanceErrors(
             stated, {name: torch.cat([part.errors[name] for part in there]) for name in names}
@@ -256,7 +263,7 @@ class DistanceErrors:
 
 
 def assign_distances_to_folds(
-    stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
+    stated_distances: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.
 
@@ -268,12 +275,16 @@ def assign_distances_to_folds(
     names = measurements.socket or ()
     known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
     folds: tuple[dict[PairOfSockets, float], ...] = tuple({} for _ in splits)
-    for number, (pair, distance) in enumerate(stated.items()):
+    for number, (pair, distance) in enumerate(stated_distances.items()):
         if not set(pair) <= set(names):
             continue
         lacking = [fold for fold, sockets in enumerate(known) if not set(pair) <= sockets]
         fold = lacking[0] if lacking else number % len(splits)
-        left = [one for one in stated if set(one) <= known[fold] and one != pair and one not in folds[fold]]
+        left = [
+            one
+            for one in stated_distances
+            if set(one) <= known[fold] and one != pair and one not in folds[fold]
+        ]
         if lacking or (left and len(splits) > 1):
             folds[fold][pair] = distance
     return folds
@@ -281,15 +292,15 @@ def assign_distances_to_folds(
 
 def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
     """Return the figures of several repeats [mm]; None if no distance was evaluated."""
-    repeats = [one for one in repeats if one.stated]
+    repeats = [one for one in repeats if one.stated_distances]
     if not repeats:
         return None
     of_each: dict[PairOfSockets, dict[str, list[float]]] = {}
     for one in repeats:
-        for number, pair in enumerate(one.stated):
+        for number, pair in enumerate(one.stated_distances):
             for name, errors in one.errors.items():
                 of_each.setdefault(pair, {}).setdefault(name, []).append(float(errors[number]) * 1e3)
-    stated = {pair: distance * 1e3 for one in repeats for pair, distance in one.stated.items()}
+    stated = {pair: distance * 1e3 for one in repeats for pair, distance in one.stated_distances.items()}
     sizes = {
         name: DistanceFigures(mean_mm=float(errors.mean()) * 1e3, max_mm=float(errors.max()) * 1e3)
         for name in repeats[0].errors

@@ -28,13 +28,13 @@ class RepeatedPose:
         accuracy: pose accuracy AP_P [m]: distance from the commanded position, which the model predicts, to the
             barycentre of the measured positions; None if the model does not have the frame of the rows.
         repeatability: pose repeatability RP_l [m]; None with fewer than `MIN_CYCLES` measurements.
-        squares: sum of the squared distances from the barycentre [m²].
+        sum_of_squares: sum of the squared distances from the barycentre [m²].
     """
 
     rows: int
     accuracy: float | None
     repeatability: float | None
-    squares: float
+    sum_of_squares: float
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, with lengths in mm."""
@@ -42,7 +42,7 @@ class RepeatedPose:
         return {"rows": self.rows, "ap_mm": ap, "rp_mm": rp}
 
 
-def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
+def pooled_scatter(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
     """Return the pooled scatter of one coordinate over poses that were measured more than once.
 
     `s² = Σ_poses Σ_j |x_j - x̄|² / (3 Σ_poses (n - 1))`, with `3 Σ (n - 1)` degrees of freedom; s contains the noise
@@ -52,7 +52,7 @@ def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
         The standard deviation of a coordinate [m] and its degrees of freedom; None without repeats.
     """
     freedom = 3 * sum(one.rows - 1 for one in poses)
-    return (math.sqrt(sum(one.squares for one in poses) / freedom), freedom) if freedom else None
+    return (math.sqrt(sum(one.sum_of_squares for one in poses) / freedom), freedom) if freedom else None
 
 
 def repeated_poses(

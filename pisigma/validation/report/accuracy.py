@@ -87,7 +87,7 @@ def accuracies(
     calibrated.
     """
     kept = _of_distilled(model) if model.kind == "distilled" else _of_metrics(model, summary)
-    if rows is None or rows.origin == "held_out":
+    if rows is None or rows.row_origin == "held_out":
         return tuple(kept)
     of_rows = _of_rows(rows)
     return (of_rows, *kept) if of_rows.held_out else (*kept, of_rows)
@@ -104,7 +104,7 @@ def figures_of(errors: PoseErrors) -> ErrorFigures:
 
 def _of_rows(rows: JudgedRows) -> Accuracy:
     models = {name: figures_of(errors) for name, errors in rows.models.items()}
-    origin: RowOrigin = "training" if rows.origin == "training" else "file"
+    origin: RowOrigin = "training" if rows.row_origin == "training" else "file"
     return Accuracy(origin, rows.measurements.rows, models, rows.measurements.source)
 
 
@@ -171,18 +171,18 @@ class AccuracyLimit:
     """Contribution of measurement scatter to the error.
 
     Attributes:
-        noise: RMS length of the scatter of a measured position [mm]; None if unknown.
-        source: source of `noise`: "repeats" of joint values in the rows, or the "hybrid" calibration.
-        error: RMS length of the position error [mm]; 0 if no position was judged.
+        scatter: RMS length of the scatter of a measured position [mm]; None if unknown.
+        source: source of `scatter`: "repeats" of joint values in the rows, or the "hybrid" calibration.
+        rms_error: RMS length of the position error [mm]; 0 if no position was judged.
         residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
             without one.
         is_approximation: whether the model approximates another model, whose errors add to its errors.
         limitations: limitations that such a model states, one sentence each.
     """
 
-    noise: float | None = None
+    scatter: float | None = None
     source: Literal["repeats", "hybrid", ""] = ""
-    error: float = 0.0
+    rms_error: float = 0.0
     residual_sigma: float | None = None
     is_approximation: bool = False
     limitations: tuple[str, ...] = ()
@@ -190,7 +190,11 @@ class AccuracyLimit:
     @property
     def scatter_share(self) -> float | None:
         """Share of the squared error that is scatter; None if it is unknown or the scatter exceeds the error."""
-        return None if self.noise is None or self.noise >= self.error else (self.noise / self.error) ** 2
+        return (
+            None
+            if self.scatter is None or self.scatter >= self.rms_error
+            else (self.scatter / self.rms_error) ** 2
+        )
 
     @property
     def is_mostly_scatter(self) -> bool:
@@ -198,7 +202,7 @@ class AccuracyLimit:
         return self.scatter_share is not None and self.scatter_share >= DOMINANT_SHARE
 
 
-def limit_of(
+def accuracy_limit(
     model: CalibratedModel,
     summary: CalibrationSummary | None,
     accuracy: Accuracy | None,
@@ -218,7 +222,7 @@ def limit_of(
         (one.sigma_mm for one in sensors if one.sigma_mm is not None and one.sensor != "corner"), None
     )
     if noise is None or not error > 0:
-        return AccuracyLimit(error=error, residual_sigma=sigma)
+        return AccuracyLimit(rms_error=error, residual_sigma=sigma)
     return AccuracyLimit(noise, source, error, sigma)
 
 

@@ -31,13 +31,13 @@ class PredictedArm:
     """Prediction of a model in an image.
 
     Attributes:
-        corners: pixels of the corners of the board [px].
-        links: pixels of the origins of the frames of the arm, from the base to the tool [px]; NaN behind the camera;
-            empty for a camera on the arm, which does not see it.
+        corner_pixels: pixels of the corners of the board [px].
+        frame_pixels: pixels of the origins of the frames of the arm, from the base to the tool [px]; NaN behind the
+            camera; empty for a camera on the arm, which does not see it.
     """
 
-    corners: Float64[np.ndarray, "corners 2"]
-    links: Float64[np.ndarray, "_frames 2"]
+    corner_pixels: Float64[np.ndarray, "corners 2"]
+    frame_pixels: Float64[np.ndarray, "_frames 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class ArmInImage:
         file: file of the image.
         name: name of the image.
         size: width and height of the image [px].
-        measured: pixels of the corners at the measured pose of the board [px].
+        measured_corners: pixels of the corners at the measured pose of the board [px].
         nominal: prediction of the nominal arm.
         calibrated: prediction of the calibrated arm.
         nominal_error: distance between the predicted and the measured board under the nominal arm [m].
@@ -58,7 +58,7 @@ class ArmInImage:
     file: Path
     name: str
     size: tuple[int, int]
-    measured: Float64[np.ndarray, "corners 2"]
+    measured_corners: Float64[np.ndarray, "corners 2"]
     nominal: PredictedArm
     calibrated: PredictedArm
     nominal_error: float
@@ -71,12 +71,12 @@ class JointZero:
 
     Attributes:
         joint: name of the joint.
-        error: calibrated minus nominal zero [deg].
+        zero_shift: calibrated minus nominal zero [deg].
         standard_error: its standard error [deg]; None if the rows do not determine it.
     """
 
     joint: str
-    error: float
+    zero_shift: float
     standard_error: float | None
 
 
@@ -125,7 +125,7 @@ class ArmInImages:
                 for one in self.images
             ],
             "zeros": [
-                {"joint": one.joint, "error_deg": one.error, "standard_error_deg": one.standard_error}
+                {"joint": one.joint, "error_deg": one.zero_shift, "standard_error_deg": one.standard_error}
                 for one in self.zeros
             ],
         }

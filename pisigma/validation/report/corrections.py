@@ -99,8 +99,8 @@ class CorrectionCurve:
         values: joint values [`unit`].
         correction: correction at these values [`correction_unit`].
         measured: whether each value was measured for the calibration.
-        dots: corrections at the measured rows that the model stores [`correction_unit`].
-        dot_values: joint values of these rows [`unit`].
+        row_corrections: corrections at the measured rows that the model stores [`correction_unit`].
+        row_values: joint values of these rows [`unit`].
     """
 
     joint: str
@@ -109,18 +109,18 @@ class CorrectionCurve:
     values: Float64[np.ndarray, " points"]
     correction: Float64[np.ndarray, " points"]
     measured: Bool[np.ndarray, " points"]
-    dots: Float64[np.ndarray, " dots"]
-    dot_values: Float64[np.ndarray, " dots"]
+    row_corrections: Float64[np.ndarray, " dots"]
+    row_values: Float64[np.ndarray, " dots"]
 
     @property
     def rms(self) -> float:
         """RMS correction at the measured rows [`correction_unit`]."""
-        return float(np.sqrt((self.dots**2).mean()))
+        return float(np.sqrt((self.row_corrections**2).mean()))
 
     @property
     def largest(self) -> float:
         """Largest absolute correction at the measured rows [`correction_unit`]."""
-        return float(np.abs(self.dots).max())
+        return float(np.abs(self.row_corrections).max())
 
     @property
     def measured_range(self) -> tuple[float, float] | None:
@@ -158,8 +158,8 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
                 values=at[:, j].numpy() * factor,
                 correction=curve.numpy() * small,
                 measured=measured.numpy(),
-                dots=at_rows[:, j].numpy() * small,
-                dot_values=q[:, j].numpy() * factor,
+                row_corrections=at_rows[:, j].numpy() * small,
+                row_values=q[:, j].numpy() * factor,
             )
         )
     return tuple(curves)
@@ -230,13 +230,13 @@ class OutsideErrors:
     """Errors of rows with joint values beyond the values with which the model was calibrated.
 
     Attributes:
-        outside: number of rows beyond the calibrated joint values.
+        rows_outside: number of rows beyond the calibrated joint values.
         rows: number of all rows.
         rms_outside: RMS position error of these rows [mm]; None if unknown.
         rms_inside: RMS position error of the other rows [mm]; None if unknown.
     """
 
-    outside: int
+    rows_outside: int
     rows: int
     rms_outside: float | None
     rms_inside: float | None
@@ -250,7 +250,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
         rows: evaluated rows, whose joint values are used unless they belong to another file; None for the joint values
             that the model stores.
     """
-    q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
+    q = model.starts if rows is None or rows.row_origin == "other" else rows.measurements.q
     if not len(q):
         return ()
     gaps = []
@@ -276,12 +276,15 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
 
 def outside_errors(rows: JudgedRows | None) -> OutsideErrors | None:
     """Return errors of rows beyond the measured joint values and of other rows; None if there are no such rows."""
-    if rows is None or bool(rows.inside.all()):
+    if rows is None or bool(rows.is_inside_range.all()):
         return None
-    after = rows.after.position.numpy() * 1e3
-    apart = [after[mask & np.isfinite(after)] for mask in (~rows.inside.numpy(), rows.inside.numpy())]
+    after = rows.model_errors.position.numpy() * 1e3
+    apart = [
+        after[mask & np.isfinite(after)]
+        for mask in (~rows.is_inside_range.numpy(), rows.is_inside_range.numpy())
+    ]
     rms = [float(np.sqrt((errors**2).mean())) if len(errors) else None for errors in apart]
-    return OutsideErrors(int((~rows.inside).sum()), rows.measurements.rows, rms[0], rms[1])
+    return OutsideErrors(int((~rows.is_inside_range).sum()), rows.measurements.rows, rms[0], rms[1])
 
 
 def measured_intervals(

@@ -12,7 +12,7 @@ from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.judged_rows import JudgedRows
-from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
+from pisigma.validation.held_out.rank_tests import SIGNIFICANT, kruskal_wallis, rank_correlation
 
 NOTABLE_RATIO = 1.25
 """Ratio of the largest to the smallest RMS error of bins below which a dependence is small."""
@@ -157,12 +157,12 @@ class ErrorsByName:
     """Errors per frame or per target.
 
     Attributes:
-        names: errors of every frame or target; empty if there is only one.
+        name_errors: errors of every frame or target; empty if there is only one.
         unit: "mm" or "deg", of the RMS errors.
         p: probability of such differences by chance (Kruskal and Wallis).
     """
 
-    names: tuple[NameErrors, ...] = ()
+    name_errors: tuple[NameErrors, ...] = ()
     unit: str = "mm"
     p: float = 1.0
 
@@ -174,7 +174,7 @@ class ErrorsByName:
     @property
     def largest(self) -> NameErrors | None:
         """Frame or target with the largest RMS error under the model; None if there are no rows."""
-        return max((one for one in self.names if one.rows), key=lambda one: one.after, default=None)
+        return max((one for one in self.name_errors if one.rows), key=lambda one: one.after, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,20 +184,20 @@ class BinnedErrors:
     Attributes:
         edges: edges of the bins, one more than there are bins.
         rms: RMS error of every bin; NaN where there are too few rows.
-        number: bin of every row.
+        bin_index: bin of every row.
     """
 
     edges: Float64[np.ndarray, " edges"]
     rms: Float64[np.ndarray, " bins"]
-    number: Int64[np.ndarray, " rows"]
+    bin_index: Int64[np.ndarray, " rows"]
 
 
 def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
     """Return errors before and after, and their unit: positions in mm, or else orientations in deg."""
-    if bool(np.isfinite(rows.after.position.numpy()).any()) or rows.after.rotation is None:
-        return rows.before.position.numpy() * 1e3, rows.after.position.numpy() * 1e3, "mm"
-    before = rows.before.rotation
-    after = rows.after.rotation.numpy() * _DEGREES
+    if bool(np.isfinite(rows.model_errors.position.numpy()).any()) or rows.model_errors.rotation is None:
+        return rows.nominal_errors.position.numpy() * 1e3, rows.model_errors.position.numpy() * 1e3, "mm"
+    before = rows.nominal_errors.rotation
+    after = rows.model_errors.rotation.numpy() * _DEGREES
     return (np.full_like(after, np.nan) if before is None else before.numpy() * _DEGREES), after, "deg"
 
 
@@ -251,7 +251,7 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName
         bias = tuple(np.nanmean(signed, 0).tolist()) if np.isfinite(signed).all(1).any() else None
         rms = [root_mean_square(lengths[inside]) for lengths in (before, after)]
         result.append(NameErrors(name, int(inside.sum()), rms[0], rms[1], bias))
-    _, chance = groups_differ(number[judged], after[judged])
+    _, chance = kruskal_wallis(number[judged], after[judged])
     return ErrorsByName(tuple(result), unit, chance)
 
 
@@ -264,7 +264,7 @@ def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> B
         return "too few rows"
     # repeated rows are not independent, so every joint configuration is tested with its mean error
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
-    _, chance = groups_differ(bins.number[first], np.bincount(group, errors) / np.bincount(group))
+    _, chance = kruskal_wallis(bins.bin_index[first], np.bincount(group, errors) / np.bincount(group))
     worst = int(np.nanargmax(bins.rms))
     edges = (float(bins.edges[worst]), float(bins.edges[worst + 1]))
     return BinTest(chance, float(np.nanmin(bins.rms)), float(bins.rms[worst]), edges)

@@ -12,8 +12,13 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.judged_rows import JudgedRows, is_inside_range, predicted_at, tool_positions
-from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ
+from pisigma.validation.held_out.judged_rows import (
+    JudgedRows,
+    is_inside_range,
+    predicted_position_sigma,
+    tool_positions,
+)
+from pisigma.validation.held_out.rank_tests import SIGNIFICANT, kruskal_wallis
 from pisigma.validation.report.dependence import MIN_ROWS, error_lengths, root_mean_square
 
 MAX_POINTS = 20_000
@@ -59,11 +64,11 @@ class ErrorMap:
         q: joint values [deg or mm].
         frame: frame of every point.
         target: target of every point.
-        inside: whether every joint value was measured for the calibration.
+        is_inside_range: whether every joint value was measured for the calibration.
         rows: number of evaluated rows; 0 for samples of the workspace.
         source: file of the rows, or name of the model.
-        origin: `JudgedRows.origin` of the rows; "" for samples of the workspace.
-        random: number of points that were drawn at random.
+        row_origin: `JudgedRows.row_origin` of the rows; "" for samples of the workspace.
+        random_points: number of points that were drawn at random.
     """
 
     position: Float64[np.ndarray, "points 3"]
@@ -72,20 +77,20 @@ class ErrorMap:
     q: Float64[np.ndarray, "points dof"]
     frame: tuple[str, ...]
     target: tuple[str, ...]
-    inside: Bool[np.ndarray, " points"]
+    is_inside_range: Bool[np.ndarray, " points"]
     rows: int
     source: str
-    origin: str
-    random: int
+    row_origin: str
+    random_points: int
 
 
 def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
     """Return the map of evaluated rows; for very many rows, the largest errors and an even selection of the others."""
-    before, after = rows.before, rows.after
+    before, after = rows.nominal_errors, rows.model_errors
     layers = _finite(
         _layer("before", before.position),
         _layer("after", after.position),
-        _layer("predicted", rows.predicted),
+        _layer("predicted", rows.predicted_sigma),
         _layer("before_deg", before.rotation, "deg"),
         _layer("after_deg", after.rotation, "deg"),
     )
@@ -94,7 +99,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
     number = torch.tensor([line or k + 1 for k, line in enumerate(rows.measurements.line)])
     points = rows.measurements.select(chosen)
     shown = [replace(layer, values=layer.values[chosen.numpy()]) for layer in layers]
-    return _map(model, points, shown, number[chosen], (count, rows.measurements.source, rows.origin, 0))
+    return _map(model, points, shown, number[chosen], (count, rows.measurements.source, rows.row_origin, 0))
 
 
 def map_of_workspace(model: CalibratedModel) -> ErrorMap:
@@ -104,7 +109,8 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
     samples = Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q), source=model.name)
     moved = model.forward(q)[:, :3, 3] - forward_kinematics(model.robot, q)[:, :3, 3]
     layers = _finite(
-        _layer("correction", moved.norm(dim=-1)), _layer("predicted", predicted_at(model, samples))
+        _layer("correction", moved.norm(dim=-1)),
+        _layer("predicted", predicted_position_sigma(model, samples)),
     )
     number = torch.zeros(len(q), dtype=torch.int64)
     return _map(model, samples, layers, number, (0, model.name, "", more))
@@ -245,7 +251,7 @@ def worst_region(
     # compare values lowered by one standard error, so that a cell of few rows is not the worst by chance
     worst, _ = max(cells, key=lambda one: root_mean_square(one[1]) * (1 - 1 / math.sqrt(len(one[1]))))
     inside = number == worst
-    _, chance = groups_differ(inside.astype(int), errors)
+    _, chance = kruskal_wallis(inside.astype(int), errors)
     corner = low + width * cell[inside][0]
     rms = root_mean_square(errors[inside])
     return Region(

@@ -14,9 +14,9 @@ class Cause:
             "joint_sign", "joint_coupling", "joint_zero", "joint_values" or "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what the fault means or what to check.
-        size: complexity of the assumption, at least 1; among equally good explanations, the simplest is chosen.
+        complexity: complexity of the assumption, at least 1; among equally good explanations, the simplest is chosen.
         joints: indices of the joints concerned, from 0.
-        moved: largest displacement of a joint zero [rad or m]; infinite for faults of other kinds.
+        largest_zero_shift: largest displacement of a joint zero [rad or m]; infinite for faults of other kinds.
         amount: displacement of a frame or tool [m]; for a wrong unit, the ratio of correct to stated values; the number
             of corrections applied in addition to those logged (1 or -1); or the number of targets with the same name.
             NaN for faults of other kinds.
@@ -27,9 +27,9 @@ class Cause:
     kind: str
     clause: str
     advice: str
-    size: float
+    complexity: float
     joints: tuple[int, ...] = ()
-    moved: float = math.inf
+    largest_zero_shift: float = math.inf
     amount: float = math.nan
     columns: tuple[int, ...] = ()
 

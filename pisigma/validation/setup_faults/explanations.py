@@ -99,10 +99,10 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], max_error: float) ->
 
 
 def fault_hypotheses(
-    arm: PredictingArm, some: Measurements, as_stated: Hypothesis, max_error: float
+    arm: PredictingArm, rows: Measurements, as_stated: Hypothesis, max_error: float
 ) -> Iterator[Hypothesis]:
     """Yield the hypotheses that may explain the errors up to `max_error` [m]; the first is that nothing is wrong."""
-    return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, as_stated)), max_error)
+    return frame_hypotheses(arm, rows, list(_faults_in_frames(arm, rows, as_stated)), max_error)
 
 
 def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
@@ -112,7 +112,7 @@ def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) 
         yield replace(here, measured=measured, causes=(cause,))
     if arm.model is not None:
         for T, cause in _other_corrections(arm.model, some):
-            yield here.with_cause(cause, T, fitted=0)
+            yield here.with_cause(cause, T, fitted_parameters=0)
     if not here.error > _SMALL_SHARE * arm.robot.reach:
         return
     for measured, cause in _likely_conventions(arm, here):
@@ -162,7 +162,7 @@ def _other_corrections(
 
 
 def frame_hypotheses(
-    arm: PredictingArm, some: Measurements, hypotheses: Sequence[Hypothesis], max_error: float = math.inf
+    arm: PredictingArm, rows: Measurements, hypotheses: Sequence[Hypothesis], max_error: float = math.inf
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses unchanged, with another frame, tool, and both; without a model, both are always fitted.
 
@@ -170,7 +170,7 @@ def frame_hypotheses(
 
     Args:
         arm: the predicting arm.
-        some: the rows; not used without a model, because every hypothesis may have other rows.
+        rows: the rows; not used without a model, because every hypothesis may have other rows.
         hypotheses: the hypotheses.
         max_error: largest error that an explanation may leave [m].
     """
@@ -179,9 +179,9 @@ def frame_hypotheses(
             yield replace(here, T=base @ here.T @ tool)
         return
     frames, targets, bases = (
-        numbers_of_names(some.frame),
-        numbers_of_names(some.target),
-        bases_of_rows(arm.model, some),
+        numbers_of_names(rows.frame),
+        numbers_of_names(rows.target),
+        bases_of_rows(arm.model, rows),
     )
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
     for here in hypotheses:
@@ -295,7 +295,8 @@ def other_conventions(
     """Yield the measured orientations under the assumption that they were written in another convention.
 
     Returns:
-        The rotations, what is wrong with the file's rotations, and the complexity of the assumption, see `Cause.size`.
+        The rotations, what is wrong with the file's rotations, and the complexity of the assumption; see
+            `Cause.complexity`.
     """
     from scipy.spatial.transform import Rotation  # imported here, because every calibration imports this file
 

@@ -129,20 +129,20 @@ class Hypothesis:
         T: predicted poses under the hypothesis.
         measured: measured poses under the hypothesis, for example in other units.
         causes: the assumed faults; empty for no fault.
-        fitted: number of parameters that were fitted.
+        fitted_parameters: number of parameters that were fitted.
     """
 
     q: Float64[Tensor, "rows dof"]
     T: Float64[Tensor, "rows 4 4"]
     measured: MeasuredPoses
     causes: tuple[Cause, ...] = ()
-    fitted: int = 0
+    fitted_parameters: int = 0
 
     @property
     def complexity(self) -> float:
         """Complexity of the causes; frame and tool together count less, because a new setup changes both."""
         kinds = {cause.kind for cause in self.causes}
-        return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
+        return sum(cause.complexity for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
     @property
     def values_of_tool(self) -> int:
@@ -152,7 +152,7 @@ class Hypothesis:
     @cached_property
     def error(self) -> float:
         """RMS error [m], corrected for the degrees of freedom."""
-        spare = self.measured.values - self.fitted
+        spare = self.measured.values - self.fitted_parameters
         if spare < _MIN_FREEDOM:
             return float("inf")
         mean = float(self.measured.squared_errors(self.T).mean()) * self.measured.values / spare
@@ -168,23 +168,30 @@ class Hypothesis:
         """Return the hypothesis without the causes of given kinds, which are not reported."""
         return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
-    def with_cause(self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted: int) -> "Hypothesis":
+    def with_cause(
+        self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted_parameters: int
+    ) -> "Hypothesis":
         """Return the hypothesis with a further cause and the poses predicted under it."""
-        return replace(self, T=T, causes=(*self.causes, cause), fitted=self.fitted + fitted)
+        return replace(
+            self,
+            T=T,
+            causes=(*self.causes, cause),
+            fitted_parameters=self.fitted_parameters + fitted_parameters,
+        )
 
 
 def shifted_rows(
-    robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
+    robot: Robot, rows: Measurements, row_indices: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
     """Yield hypotheses with joint values or orientations shifted by rows, in all rows or on one side of a row.
 
     Args:
         robot: the nominal robot.
         rows: rows in the order of the file.
-        chosen: indices of the rows to evaluate, at least `MARGIN` rows from both ends.
+        row_indices: indices of the rows to evaluate, at least `MARGIN` rows from both ends.
         measured: measured poses of these rows.
     """
-    q = rows.q[chosen]
+    q = rows.q[row_indices]
     for shift in _SHIFTS:
         cause = Cause(
             "rows",
@@ -192,16 +199,16 @@ def shifted_rows(
             _ADVICE,
             1.0,
         )
-        yield rows.q[chosen + shift], measured, cause
+        yield rows.q[row_indices + shift], measured, cause
         if bool(measured.has_rotation.any()):
             assert rows.rotation is not None
-            other = rows.rotation[chosen + shift]
+            other = rows.rotation[row_indices + shift]
             there = torch.isfinite(other).flatten(1).all(1)
             rotations = replace(measured, rotation=torch.where(there[:, None, None], other, 0.0))
             rotations = replace(rotations, has_rotation=there & measured.has_rotation)
             clause = f"the orientations are shifted by {_count(shift)} relative to the positions"
             yield q, rotations, Cause("rows", clause, _ADVICE, 1.0)
-    yield from _shifted_from_a_row(robot, rows, chosen)
+    yield from _shifted_from_a_row(robot, rows, row_indices)
 
 
 def _shifted_from_a_row(

@@ -146,15 +146,15 @@ def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
     return replace(JointMaps.unchanged(len(choices), robot.dof), offset=torch.from_numpy(offset))
 
 
-def moved_zeros(joints: Int64[Tensor, " maps"], by: Float64[Tensor, " maps"], dof: int) -> JointMaps:
+def moved_zeros(joints: Int64[Tensor, " maps"], shifts: Float64[Tensor, " maps"], dof: int) -> JointMaps:
     """Return maps that each move the zero of one joint by a given amount [rad or m]."""
     maps = JointMaps.unchanged(len(joints), dof)
-    return replace(maps, offset=maps.offset.index_put((torch.arange(len(joints)), joints), by))
+    return replace(maps, offset=maps.offset.index_put((torch.arange(len(joints)), joints), shifts))
 
 
-def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...]:
+def joint_causes(maps: JointMaps, map_index: int, robot: Robot) -> tuple[Cause, ...]:
     """Return the causes that a map assumes: what is wrong with the joint columns."""
-    matrix, offset = maps.matrix[number], maps.offset[number].tolist()
+    matrix, offset = maps.matrix[map_index], maps.offset[map_index].tolist()
     order = matrix.abs().argmax(1).tolist()
     factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
     if int((matrix != 0).sum()) > robot.dof:

@@ -144,7 +144,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
     here = next(frame_hypotheses(arm, rows, [Hypothesis(rows.q, arm.poses(rows), measured)]))
-    return replace(here, fitted=here.fitted + robot.dof).error
+    return replace(here, fitted_parameters=here.fitted_parameters + robot.dof).error
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
@@ -300,23 +300,23 @@ def target_labellings(
 
 
 def fit_targets(
-    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, number: Int64[Tensor, " rows"]
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, target_index: Int64[Tensor, " rows"]
 ) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "rows 4 4"]]:
     """Fit base and targets to measured poses alternately: the base with the mean target, then every target.
 
     Args:
         T: predicted poses, with any base and tool.
         measured: the measured poses.
-        number: index of every row's target.
+        target_index: index of every row's target.
 
     Returns:
         The base, and the poses predicted with it.
     """
-    places = torch.zeros(int(number.max()) + 1, 3).to(T)
+    places = torch.zeros(int(target_index.max()) + 1, 3).to(T)
     last = math.inf
     for _ in range(_MAX_TARGET_ITERATIONS):
         of_rows = T.clone()
-        of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
+        of_rows[:, :3, 3] += (T[:, :3, :3] @ places[target_index][..., None])[..., 0]
         base, tool = best_base_and_tool(of_rows, measured)
         fitted = base @ of_rows @ tool
         error = float(measured.squared_errors(fitted).mean())
@@ -324,7 +324,7 @@ def fit_targets(
             break
         last = error
         points = _in_tool_frame(base @ T, measured)
-        places = torch.stack([points[number == k].mean(0) for k in range(len(places))])
+        places = torch.stack([points[target_index == k].mean(0) for k in range(len(places))])
     return base, fitted
 
 

@@ -52,24 +52,24 @@ class OrderedRows:
     Attributes:
         result: the geometric calibration.
         problem: the problem of these rows.
-        number: index of every row in the measurements.
+        row_index: index of every row in the measurements.
         residual: three values per sensor, 0 where nothing was measured.
         derivative: derivative of the values with respect to all parameters.
-        values: number of measured values.
+        value_count: number of measured values.
         noise: standard deviation of every column of values [m or rad], or the factor on the standard deviations
             stated in the rows.
-        sizes: factors on the prior standard deviations of the weights of each kind of joint errors, if they were
-            estimated; empty for stated sizes, and for the sag of masses at the origins of the frames alone.
+        prior_factors: factors on the prior standard deviations of the weights of each kind of joint errors, if they
+            were estimated; empty for stated sizes, and for the sag of masses at the origins of the frames alone.
     """
 
     result: CalibrationResult
     problem: CalibrationProblem
-    number: Int64[np.ndarray, " rows"]
+    row_index: Int64[np.ndarray, " rows"]
     residual: Float64[np.ndarray, "rows values"]
     derivative: Float64[np.ndarray, "rows values parameters"]
-    values: int
+    value_count: int
     noise: Float64[np.ndarray, " values"]
-    sizes: tuple[float, ...] = ()
+    prior_factors: tuple[float, ...] = ()
 
     @cached_property
     def content_hash(self) -> bytes:
@@ -77,12 +77,16 @@ class OrderedRows:
 
         The same rows are used in a calibration when they are added to a cell, and again for its model.
         """
-        setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
+        setup = (
+            self.problem.frame.cpu().numpy(),
+            self.problem.target.cpu().numpy(),
+            self.configuration_index,
+        )
         names = (self.problem.space.frames, self.problem.space.targets)  # the result already contains them
-        counts = (self.jacobian.shape, self.values, self.configuration is None)
+        counts = (self.jacobian.shape, self.value_count, self.configuration_index is None)
         digest = hashlib.sha256(repr((names, counts)).encode())
         for one in (
-            self.number,
+            self.row_index,
             self.residual,
             self.derivative,
             self.jacobian,
@@ -144,7 +148,7 @@ class OrderedRows:
         return OrderedRows(geometric, problem, rows[some].numpy(), *flat, values, np.array(noise))
 
     @cached_property
-    def clipped(self) -> Float64[np.ndarray, "rows values"]:
+    def clipped_residual(self) -> Float64[np.ndarray, "rows values"]:
         """Residuals; large ones are shortened so that they do not dominate the search for a fault."""
         lengths = np.linalg.norm(self.residual, axis=1)
         longest = _CAP * np.quantile(lengths, 0.75)
@@ -196,16 +200,18 @@ class OrderedRows:
         """
         robot = self.problem.space.robot
         play = Backlash(robot)
-        backlash = ((play, play.used.numpy(), _JOINT_ERROR),) if APPROACH in self.problem.state.stated else ()
+        backlash = (
+            ((play, play.used.numpy(), _JOINT_ERROR),) if APPROACH in self.problem.state.conditions else ()
+        )
         series, sag = (
             FourierSeries(robot, _HARMONICS),
             GravityTorques(robot, to_first_row_frame(robot, USUAL)),
         )
         is_mass = np.arange(sag.used.shape[1]) % 4 == 0
-        moments = ((sag, sag.used.numpy() & ~is_mass, _SAG),) if self.sizes else ()
+        moments = ((sag, sag.used.numpy() & ~is_mass, _SAG),) if self.prior_factors else ()
         masses = (sag, sag.used.numpy() & is_mass, _SAG)
         kinds = ((series, series.used.numpy(), _JOINT_ERROR), masses, *moments, *backlash)
-        sizes = self.sizes or (1.0,) * len(kinds)
+        sizes = self.prior_factors or (1.0,) * len(kinds)
         return tuple(
             (feature, used, size * factor) for (feature, used, size), factor in zip(kinds, sizes, strict=True)
         )
@@ -216,7 +222,7 @@ class OrderedRows:
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
         view = sensor_view_of(self.result.solved.refined_linearisation)
-        if self.sizes:
+        if self.prior_factors:
             view = replace(view, prior_scale=view.prior_scale.clamp(min=MIN_USUAL_SCALE))
         precision = view.scaled_precision(active, self.problem.prior_group).cpu().numpy()
         unit = np.where(robot.revolute, 1.0, robot.reach)[:, None]
@@ -242,8 +248,8 @@ class OrderedRows:
         parameters that every sensor determines of Förstner 1979), and the prior of the geometry is not narrower than
         usual.
         """
-        kinds = 3 + (APPROACH in self.problem.state.stated)
-        rows = replace(self, sizes=(1.0,) * kinds)
+        kinds = 3 + (APPROACH in self.problem.state.conditions)
+        rows = replace(self, prior_factors=(1.0,) * kinds)
         weights = [int(used.sum()) for _, used, _ in rows._joint_errors]
         kind = np.repeat(np.arange(-1, kinds), [len(rows.precision) - sum(weights), *weights])
         scale, sizes = _noise_and_sizes(rows, kind)
@@ -253,7 +259,7 @@ class OrderedRows:
             residual=self.residual / scale,
             derivative=self.derivative / scale[:, None],
             noise=self.noise * scale,
-            sizes=tuple(sizes.tolist()),
+            prior_factors=tuple(sizes.tolist()),
         )
 
     @cached_property
@@ -268,9 +274,9 @@ class OrderedRows:
         return left
 
     @cached_property
-    def unexplained(self) -> Float64[np.ndarray, " values"]:
+    def unexplained_residual(self) -> Float64[np.ndarray, " values"]:
         """Clipped residuals after fitting the parameters and the series of joint errors."""
-        return self.without_parameters(self.clipped.ravel())
+        return self.without_parameters(self.clipped_residual.ravel())
 
     def evidence_of(self, columns: Float64[np.ndarray, "values sizes"]) -> "Effect":
         """Fit further columns to the unexplained residuals (Frisch-Waugh).
@@ -280,10 +286,10 @@ class OrderedRows:
         Args:
             columns: derivatives of the values with respect to the sizes, after `without_parameters`.
         """
-        left, count = self.unexplained, columns.shape[1]
+        left, count = self.unexplained_residual, columns.shape[1]
         sizes = np.linalg.lstsq(columns, left, rcond=None)[0]
         ratio = max(float(((left - columns @ sizes) ** 2).sum() / (left @ left)), 1e-12)
-        spare = max(self.values - self.effective_parameters, 1.0)
+        spare = max(self.value_count - self.effective_parameters, 1.0)
         freedom = self.degrees_of_freedom
         odds = -freedom / 2 * math.log(ratio) - count * math.log(max(freedom, 2.0)) / 2
         return Effect(sizes, math.sqrt(spare / max(spare - count, 1.0) / ratio), odds)
@@ -294,7 +300,7 @@ class OrderedRows:
         return float((self.jacobian * (self.jacobian @ self.covariance)).sum())
 
     @cached_property
-    def configuration(self) -> Int64[np.ndarray, " rows"] | None:
+    def configuration_index(self) -> Int64[np.ndarray, " rows"] | None:
         """Index of every row's configuration (joint values, frame, and optionally target); None if all rows differ."""
         group = self.problem.pose if self.problem.configuration is None else self.problem.configuration
         return None if group is None else renumber(group).cpu().numpy()
@@ -302,10 +308,12 @@ class OrderedRows:
     @property
     def degrees_of_freedom(self) -> float:
         """Degrees of freedom after the calibration, with at most one pose per configuration, and no repeats."""
-        values, columns = self.values, self.residual.shape[1]
-        if self.configuration is not None:
-            targets = np.unique([self.configuration, self.problem.target.cpu().numpy()], axis=1).shape[1]
-            configurations = int(self.configuration.max()) + 1
+        values, columns = self.value_count, self.residual.shape[1]
+        if self.configuration_index is not None:
+            targets = np.unique([self.configuration_index, self.problem.target.cpu().numpy()], axis=1).shape[
+                1
+            ]
+            configurations = int(self.configuration_index.max()) + 1
             values = min(values, _VALUES_PER_POSE * configurations, columns * targets)
         return values - self.effective_parameters
 
@@ -325,7 +333,7 @@ def _noise_and_sizes(
     sensors, weights = rows.residual.shape[1] // 3, kind >= 0
     X, r = (
         np.moveaxis(values.reshape(len(values), sensors, 3, -1), 1, 0).reshape(sensors, 3 * len(values), -1)
-        for values in (rows.jacobian, rows.clipped)
+        for values in (rows.jacobian, rows.clipped_residual)
     )
     measured, normal, descent = X.any(2).sum(1), X.swapaxes(1, 2) @ X, (X.swapaxes(1, 2) @ r)[..., 0]
     variance, sizes, held = np.ones(sensors), np.ones(kind.max() + 1), rows.precision.copy()
@@ -352,13 +360,13 @@ class Effect(NamedTuple):
     """An effect that residuals contain in addition to the parameters of the calibration.
 
     Attributes:
-        sizes: fitted sizes.
-        factor: ratio of the errors without and with the effect [1].
+        effect_sizes: fitted sizes.
+        error_ratio: ratio of the errors without and with the effect [1].
         log_bayes_factor: logarithm of the odds of the effect against none.
     """
 
-    sizes: Float64[np.ndarray, " sizes"]
-    factor: float
+    effect_sizes: Float64[np.ndarray, " sizes"]
+    error_ratio: float
     log_bayes_factor: float
 
 

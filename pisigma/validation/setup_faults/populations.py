@@ -44,20 +44,20 @@ class Populations:
 
     Attributes:
         differing_part: what differs between the populations: base, tool or arm.
-        second: mask of the measured rows that belong to the smaller population.
+        in_smaller_population: mask of the measured rows that belong to the smaller population.
         evaluated_rows: number of rows that were evaluated.
         difference: difference of the base, tool or arm parameters of the populations [m or rad].
-        factor: ratio of the errors of the rows without and with the difference [1].
+        error_ratio: ratio of the errors of the rows without and with the difference [1].
         absorbed_share: share of the values that all fitted parameters absorb [1].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
 
     differing_part: _Differing
-    second: Bool[np.ndarray, " rows"]
+    in_smaller_population: Bool[np.ndarray, " rows"]
     evaluated_rows: int
     difference: Float64[np.ndarray, " numbers"]
-    factor: float
+    error_ratio: float
     absorbed_share: float
     log_bayes_factor: float
 
@@ -83,21 +83,21 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
         return None
     index = np.unique(np.linspace(0, len(rows.residual) - 1, _MAX_ROWS).round().astype(int))
     some = index if len(rows.residual) > _MAX_ROWS else np.arange(len(rows.residual))
-    independent = rows.degrees_of_freedom / max(rows.values - rows.effective_parameters, 1.0)
+    independent = rows.degrees_of_freedom / max(rows.value_count - rows.effective_parameters, 1.0)
     found = []
     for differing, Z, precision in _differences(rows):
         fit = _Mixture(rows, Z, precision).fit_from_starts(some)
         if fit.used > _most_used(rows.residual.shape[1]) * fit.values:
             continue
         second = np.zeros(count, dtype=bool)
-        second[rows.number] = _alternating(fit.probability > 0.5)
-        if second.sum() > len(rows.number) / 2:
-            second[rows.number] = ~second[rows.number]
+        second[rows.row_index] = _alternating(fit.probability > 0.5)
+        if second.sum() > len(rows.row_index) / 2:
+            second[rows.row_index] = ~second[rows.row_index]
         found.append(
             Populations(
                 differing,
                 second,
-                len(rows.number),
+                len(rows.row_index),
                 fit.difference,
                 fit.factor,
                 fit.used / fit.values,

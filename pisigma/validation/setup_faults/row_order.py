@@ -37,26 +37,26 @@ class Motion:
     """A rigid motion of a frame or of a tool while the rows were measured.
 
     Attributes:
-        moved: "frame", "target" (one of several on the tool) or "tool".
+        kind: "frame", "target" (one of several on the tool) or "tool".
         name: name of the frame or the target.
         rows: indices of the rows of the frame or target in the measurements, in the order of the file.
-        first: index in `rows` of the first row after the motion; None for a slow motion over all rows.
+        first_row: index in `rows` of the first row after the motion; None for a slow motion over all rows.
         shift: mean shift of the measured points [m], in their frame, or for a tool in the flange frame; for a slow
             motion the largest shift since the first row.
         turn: rotation angle of the frame or tool [rad]; for a slow motion the largest angle since the first row.
         log_bayes_factor: logarithm of the odds of the motion against no motion, at equal prior odds.
-        factor: ratio of the errors of the rows without and with the motion in the model [1].
+        error_ratio: ratio of the errors of the rows without and with the motion in the model [1].
         begins_frame: whether a target or the tool moved exactly where rows of another frame start.
     """
 
-    moved: _Moved
+    kind: _Moved
     name: str
     rows: Int64[np.ndarray, " rows"]
-    first: int | None
+    first_row: int | None
     shift: Float64[np.ndarray, " 3"]
     turn: float
     log_bayes_factor: float
-    factor: float
+    error_ratio: float
     begins_frame: bool = False
 
 
@@ -187,7 +187,7 @@ class _Search:
         for candidate in self._rigid():
             count = len(candidate.index)
             if count > 2 * _MIN_ROWS:
-                yield candidate.from_row(self._best_step(self.rows.clipped, candidate))
+                yield candidate.from_row(self._best_step(self.rows.clipped_residual, candidate))
                 time = (2 * np.arange(count) + 1) / count - 1
                 for degree in DEGREES:
                     # A constant motion is one of base or tool, which the calibration fits.
@@ -271,7 +271,7 @@ class _Search:
         A = A.reshape(-1, size + motions)
         held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
         # Fitted residuals are too small by the root of the share of values that the parameters leave free.
-        left = max(1 - (self.rows.effective_parameters + motions) / self.rows.values, 1e-2)
+        left = max(1 - (self.rows.effective_parameters + motions) / self.rows.value_count, 1e-2)
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
         for _ in range(MAX_ITERATIONS):
             weighted = A * (weight / np.repeat(scale, 3) ** 2).reshape(-1, 1)
@@ -297,12 +297,12 @@ class _Search:
             fit: fit of the candidate.
             values_per_independent: number of values per independent value.
         """
-        if fit.effective_unknowns > _MAX_USED * self.rows.values:
+        if fit.effective_unknowns > _MAX_USED * self.rows.value_count:
             return -math.inf
         # Correlated values and repeats contain no more information than one pose per configuration.
         values = max(
             min(
-                (self.rows.values - self.rows.effective_parameters) / values_per_independent,
+                (self.rows.value_count - self.rows.effective_parameters) / values_per_independent,
                 self.rows.degrees_of_freedom,
             ),
             1.0,
@@ -330,7 +330,7 @@ class _Search:
             if two < 0:
                 break
             alike += 2 * two
-        repeated, configuration = 1.0, self.rows.configuration
+        repeated, configuration = 1.0, self.rows.configuration_index
         if configuration is not None:
             count = np.bincount(configuration)
             means = np.stack([np.bincount(configuration, column) for column in left.T]) ** 2 / count
@@ -353,14 +353,14 @@ class _Search:
         if candidate.moved == "frame":
             names = self.rows.problem.space.frames
             anchor = self.rows.result.solved.setup.anchors.bases[candidate.number].cpu().numpy()
-            center = self._center(self.rows.number[candidate.index[candidate.first or 0 :]])
+            center = self._center(self.rows.row_index[candidate.index[candidate.first or 0 :]])
             # The base rotates about its anchor, so the shift of the measured points is that of their centre.
             lever = anchor[:3, :3].T @ (center - anchor[:3, 3])
             shift = anchor[:3, :3] @ (shift + np.cross(turn, lever))
         return Motion(
             candidate.moved,
             names[candidate.number],
-            self.rows.number[candidate.index],
+            self.rows.row_index[candidate.index],
             candidate.first,
             shift,
             float(np.linalg.norm(turn)),

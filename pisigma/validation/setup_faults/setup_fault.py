@@ -19,13 +19,13 @@ class SetupFault:
         kinds: kinds of the causes, see `Cause.kind`.
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what to check.
-        before: root mean square of the position errors [m].
-        after: root mean square of the position errors after correction of the fault [m].
-        after_nominal: root mean square of the nominal robot's errors after correction of the fault [m]; NaN if the
+        rms_before: root mean square of the position errors [m].
+        rms_after: root mean square of the position errors after correction of the fault [m].
+        nominal_rms_after: root mean square of the nominal robot's errors after correction of the fault [m]; NaN if the
             fault concerns the joint correction.
-        before_rotation: root mean square of the rotation errors [rad]; NaN if none was measured.
-        after_rotation: root mean square of the rotation errors after correction of the fault [rad].
-        moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
+        rotation_rms_before: root mean square of the rotation errors [rad]; NaN if none was measured.
+        rotation_rms_after: root mean square of the rotation errors after correction of the fault [rad].
+        largest_zero_shift: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         joints: indices of the joints concerned, from 0.
         amounts: amount of every cause, see `Cause.amount`.
         columns: columns with the values of every joint, see `Cause.columns`.
@@ -34,12 +34,12 @@ class SetupFault:
     kinds: tuple[str, ...]
     clause: str
     advice: str
-    before: float
-    after: float
-    after_nominal: float
-    before_rotation: float
-    after_rotation: float
-    moved: float = math.inf
+    rms_before: float
+    rms_after: float
+    nominal_rms_after: float
+    rotation_rms_before: float
+    rotation_rms_after: float
+    largest_zero_shift: float = math.inf
     joints: tuple[int, ...] = ()
     amounts: tuple[float, ...] = ()
     columns: tuple[int, ...] = ()
@@ -47,20 +47,20 @@ class SetupFault:
     @property
     def explains_orientation(self) -> bool:
         """Whether the fault also explains the rotation errors."""
-        return self.after_rotation <= COLLAPSED * self.before_rotation
+        return self.rotation_rms_after <= COLLAPSED * self.rotation_rms_before
 
     @property
     def sentence(self) -> str:
         """Sentence about what is wrong, the errors after its correction, and what to check."""
         clause = self.clause[:1].upper() + self.clause[1:]
-        if not np.isfinite(self.after):
+        if not np.isfinite(self.rms_after):
             return f"{clause}; {self.advice}."
-        fall = f"from {length_text(self.before)} to {length_text(self.after)} RMS"
-        if np.isfinite(self.before_rotation):
-            degrees = np.rad2deg([self.before_rotation, self.after_rotation])
+        fall = f"from {length_text(self.rms_before)} to {length_text(self.rms_after)} RMS"
+        if np.isfinite(self.rotation_rms_before):
+            degrees = np.rad2deg([self.rotation_rms_before, self.rotation_rms_after])
             fall += f" and from {degrees[0]:.3g} deg to {degrees[1]:.3g} deg"
-        if np.isfinite(self.after_nominal):
-            fall += f" (those of the nominal robot to {length_text(self.after_nominal)})"
+        if np.isfinite(self.nominal_rms_after):
+            fall += f" (those of the nominal robot to {length_text(self.nominal_rms_after)})"
         return f"{clause}: with this corrected, the errors fall {fall}; {self.advice}."
 
     def diagnostic(self, severity: Severity = "implausible") -> Diagnostic:
@@ -82,7 +82,7 @@ class SetupFault:
     @property
     def values(self) -> dict[str, float | int | str | tuple[int, ...]]:
         """Numbers in the sentence, by name, with joints counted from 1; see `Diagnostic.values`."""
-        figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
+        figures = {"before_mm": self.rms_before * 1e3, "after_mm": self.rms_after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
             finite["ratio"] = self.amounts[0]
@@ -92,11 +92,11 @@ class SetupFault:
     def to_json(self) -> dict[str, object]:
         """Return kinds, sentence and errors in mm and, if measured, in deg."""
         figures = {
-            "before_rms_mm": self.before * 1e3,
-            "after_rms_mm": self.after * 1e3,
-            "after_nominal_rms_mm": self.after_nominal * 1e3,
-            "before_rms_deg": float(np.rad2deg(self.before_rotation)),
-            "after_rms_deg": float(np.rad2deg(self.after_rotation)),
+            "before_rms_mm": self.rms_before * 1e3,
+            "after_rms_mm": self.rms_after * 1e3,
+            "after_nominal_rms_mm": self.nominal_rms_after * 1e3,
+            "before_rms_deg": float(np.rad2deg(self.rotation_rms_before)),
+            "after_rms_deg": float(np.rad2deg(self.rotation_rms_after)),
         }
         measured = {name: value for name, value in figures.items() if np.isfinite(value)}
         return {"kinds": list(self.kinds), "sentence": self.sentence, **measured}
@@ -108,16 +108,16 @@ def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
         return faults[0]
     clauses = dict.fromkeys(fault.clause for fault in faults)
     advice = dict.fromkeys(fault.advice for fault in faults)
-    moved = max(fault.moved for fault in faults)
+    moved = max(fault.largest_zero_shift for fault in faults)
     clause, advised = ", or ".join(clauses), "; ".join(advice)
-    return replace(faults[0], clause=clause, advice=advised, moved=moved, amounts=(), columns=())
+    return replace(faults[0], clause=clause, advice=advised, largest_zero_shift=moved, amounts=(), columns=())
 
 
-def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
+def fault_of_cause(cause: Cause, rms_before: float, rms_after: float) -> SetupFault:
     """Return the fault of a single cause, with the RMS position errors before and after its correction [m]."""
     nan = math.nan
     return SetupFault(
-        *((cause.kind,), cause.clause, cause.advice, before, after, nan, nan, nan),
+        *((cause.kind,), cause.clause, cause.advice, rms_before, rms_after, nan, nan, nan),
         joints=cause.joints,
         columns=cause.columns,
     )
@@ -130,12 +130,12 @@ def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, after_nomina
         kinds=tuple(cause.kind for cause in other.causes),
         clause=" and ".join(cause.clause for cause in other.causes),
         advice="; ".join(cause.advice for cause in other.causes),
-        before=before,
-        after=after,
-        after_nominal=after_nominal,
-        before_rotation=before_rotation,
-        after_rotation=after_rotation,
-        moved=max(cause.moved for cause in other.causes),
+        rms_before=before,
+        rms_after=after,
+        nominal_rms_after=after_nominal,
+        rotation_rms_before=before_rotation,
+        rotation_rms_after=after_rotation,
+        largest_zero_shift=max(cause.largest_zero_shift for cause in other.causes),
         joints=tuple(joint for cause in other.causes for joint in cause.joints),
         amounts=tuple(cause.amount for cause in other.causes),
         columns=next((cause.columns for cause in other.causes if cause.columns), ()),

@@ -76,7 +76,7 @@ def find_setup_faults(
     here = Hypothesis(some.q, T, measured)
     if fitted:
         T, columns = fit_frames(T, measured, some, fitted)
-        here = replace(here, T=T, fitted=columns.shape[-1])
+        here = replace(here, T=T, fitted_parameters=columns.shape[-1])
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)

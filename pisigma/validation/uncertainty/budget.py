@@ -54,7 +54,7 @@ class UncertaintyBudget:
     missing: tuple[str, ...] = ()
 
     @property
-    def combined(self) -> float:
+    def combined_uncertainty(self) -> float:
         """Combined standard uncertainty [m]: `u_c² = Σ u_i²` (JCGM 100:2008, 5.1.2)."""
         return math.sqrt(sum(one.standard_uncertainty**2 for one in self.components))
 
@@ -63,7 +63,7 @@ class UncertaintyBudget:
         """Effective degrees of freedom, `u_c⁴ / Σ (u_i⁴ / ν_i)` (Welch-Satterthwaite; JCGM 100:2008, G.4.1)."""
         finite = [(one.standard_uncertainty, one.degrees_of_freedom) for one in self.components]
         spread = sum(u**4 / freedom for u, freedom in finite if freedom is not None)
-        return self.combined**4 / spread if spread > 0 else math.inf
+        return self.combined_uncertainty**4 / spread if spread > 0 else math.inf
 
     @property
     def coverage_factor(self) -> float:
@@ -73,12 +73,12 @@ class UncertaintyBudget:
         return float(stats.t.ppf((1 + COVERAGE) / 2, self.effective_degrees_of_freedom))
 
     @property
-    def expanded(self) -> float:
+    def expanded_uncertainty(self) -> float:
         """Expanded uncertainty of a coordinate [m]: `U = k u_c` (JCGM 100:2008, 6.2.1)."""
-        return self.coverage_factor * self.combined
+        return self.coverage_factor * self.combined_uncertainty
 
     @property
-    def radius(self) -> float:
+    def coverage_radius(self) -> float:
         """Radius about the commanded position that contains the tool with the probability `COVERAGE` [m].
 
         It is `u_c √(3 F)` with the quantile F of the F distribution with 3 and the effective degrees of freedom, for
@@ -89,8 +89,8 @@ class UncertaintyBudget:
 
         freedom = self.effective_degrees_of_freedom
         if math.isinf(freedom):
-            return self.combined * math.sqrt(float(stats.chi2.ppf(COVERAGE, 3)))
-        return self.combined * math.sqrt(3 * float(stats.f.ppf(COVERAGE, 3, freedom)))
+            return self.combined_uncertainty * math.sqrt(float(stats.chi2.ppf(COVERAGE, 3)))
+        return self.combined_uncertainty * math.sqrt(3 * float(stats.f.ppf(COVERAGE, 3, freedom)))
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values with lengths in mm; without components there are no combined figures."""
@@ -102,10 +102,10 @@ class UncertaintyBudget:
             return plain
         freedom = self.effective_degrees_of_freedom
         return plain | {
-            "combined_mm": self.combined * 1e3,
+            "combined_mm": self.combined_uncertainty * 1e3,
             "effective_degrees_of_freedom": "infinite" if math.isinf(freedom) else freedom,
             "coverage": COVERAGE,
             "coverage_factor": self.coverage_factor,
-            "expanded_mm": self.expanded * 1e3,
-            "radius_mm": self.radius * 1e3,
+            "expanded_mm": self.expanded_uncertainty * 1e3,
+            "radius_mm": self.coverage_radius * 1e3,
         }

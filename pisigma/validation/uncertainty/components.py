@@ -28,7 +28,7 @@ def uncertainty_budget(
     rows_name: str,
     instrument: Instrument,
     temperatures: Mapping[str, float | None],
-    made_of: Sequence[str],
+    session_names: Sequence[str],
     expansion_per_k: float | None,
     repeatability_mm: float | None = None,
 ) -> UncertaintyBudget:
@@ -44,7 +44,7 @@ def uncertainty_budget(
         rows_name: name of these rows.
         instrument: the instrument of the cell.
         temperatures: mean temperature of every session [deg C], by name; None if the rows do not state it.
-        made_of: names of the sessions to which the model was fitted.
+        session_names: names of the sessions to which the model was fitted.
         expansion_per_k: coefficient of linear expansion of the arm [1/K]; None if it is not stated.
         repeatability_mm: pose repeatability RP stated by the manufacturer [mm], which is used if the scatter is
             unknown; None if it is not stated.
@@ -55,7 +55,7 @@ def uncertainty_budget(
         scatter,
         *([repeatability_component(repeatability_mm)] if isinstance(scatter, str) else []),
         instrument_component(instrument),
-        thermal_component(model, temperatures, made_of, expansion_per_k),
+        thermal_component(model, temperatures, session_names, expansion_per_k),
     )
     components = tuple(one for one in found if isinstance(one, Component))
     return UncertaintyBudget(components, tuple(one for one in found if isinstance(one, str)))
@@ -132,7 +132,7 @@ def instrument_component(instrument: Instrument) -> Component | str:
 def thermal_component(
     model: CalibratedModel,
     temperatures: Mapping[str, float | None],
-    made_of: Sequence[str],
+    session_names: Sequence[str],
     expansion_per_k: float | None,
 ) -> Component | str:
     """Evaluate the thermal expansion that the model does not compensate.
@@ -147,7 +147,7 @@ def thermal_component(
     if expansion_per_k is None:
         return f"{what}: expansion_per_k in cell.yaml."
     known = {name: value for name, value in temperatures.items() if value is not None}
-    first = [known[name] for name in made_of if name in known]
+    first = [known[name] for name in session_names if name in known]
     if not first:
         return f"{what}: the temperature of the calibration."
     mean = sum(first) / len(first)

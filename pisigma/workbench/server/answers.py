@@ -7,7 +7,7 @@ from typing import Any
 
 from aiohttp import web
 
-from pisigma.files.errors import PisigmaError, system_fault
+from pisigma.files.errors import PisigmaError, system_problem_text
 from pisigma.workbench.job import BusyError
 
 _MAX_PERSON = 60
@@ -28,7 +28,7 @@ def with_error_answers(function: Callable[[Any, web.Request], Awaitable[web.Stre
             }
             return web.json_response(fields, status=422)
         except (OSError, MemoryError) as problem:
-            if not (fault := system_fault(problem)):
+            if not (fault := system_problem_text(problem)):
                 raise
             return web.json_response({"error": self._uploads.without_folder(fault), "field": ""}, status=422)
         except BusyError:

@@ -108,7 +108,7 @@ class SessionView:
 
     def show_state(self, state: SessionState) -> None:
         """Show a state of the session on all open pages."""
-        top = top_of_scale(state.rows)
+        top = color_scale_maximum(state.rows)
         with self._lock, self._server.atomic():
             self._state = state
             if not self._magnified_by_hand:
@@ -129,7 +129,7 @@ class SessionView:
             self._magnified_by_hand = True
             if self._state is not None:
                 rows = self._state.rows
-                self._scene.show_rows(rows, top_of_scale(rows), self._panel.magnification.value)
+                self._scene.show_rows(rows, color_scale_maximum(rows), self._panel.magnification.value)
 
 
 def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
@@ -154,7 +154,7 @@ def arrow_magnification(max_error: float, reach: float) -> int:
     return step * round(float(np.clip(_ERROR_SHARE * reach / max_error, low + step, high)) / step)
 
 
-def top_of_scale(rows: RowsSoFar) -> float:
+def color_scale_maximum(rows: RowsSoFar) -> float:
     """Return the error at the end of the colour scale: the 95 % quantile of the used rows, rounded up [m]."""
     errors = np.linalg.norm(rows.error, axis=1)[~rows.alarmed]
     errors = errors[np.isfinite(errors)]

@@ -189,11 +189,11 @@ def posterior_of(arm: Arm, calibration: Calibration, torso: tuple[str, ...]) -> 
                 at=rows.place_of(int(stated.long().argmin()), column),
                 remedy="state the same name in the row of the other arm, and the play of the tips as 'sigma_mm'",
             )
-    touches = Touches.from_measurements(rows, moved_joints(calibration, rows))
+    touches = Touches.from_measurements(rows, corrected_joint_values(calibration, rows))
     return ArmPosterior(arm.name, known, touches, torso)
 
 
-def moved_joints(calibration: Calibration, rows: Measurements) -> Float64[Tensor, "rows dof"]:
+def corrected_joint_values(calibration: Calibration, rows: Measurements) -> Float64[Tensor, "rows dof"]:
     """Return the joint values of rows with their corrections [rad or m]."""
     hybrid = calibration.model.hybrid
     return rows.q if hybrid is None else corrected_joints(hybrid, rows)
@@ -202,7 +202,7 @@ def moved_joints(calibration: Calibration, rows: Measurements) -> Float64[Tensor
 def postures_of(calibration: Calibration) -> Postures:
     """Return the postures of some rows of a calibration, in random order."""
     rows = calibration.rows.select(randomly_chosen_rows(calibration.rows.rows, _MAX_POSTURES))
-    return Postures(JointState.from_measurements(rows), moved_joints(calibration, rows))
+    return Postures(JointState.from_measurements(rows), corrected_joint_values(calibration, rows))
 
 
 def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) -> ArmsCalibration:

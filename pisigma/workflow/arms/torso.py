@@ -85,12 +85,12 @@ def torso_settings(name: str, settings: CalibrationSettings) -> CalibrationSetti
     return settings if settings.model == "geometric" else replace(settings, features=())
 
 
-def with_common_joints(calibration: Calibration, found: ArmPosterior) -> Calibration:
+def with_common_joints(calibration: Calibration, posterior: ArmPosterior) -> Calibration:
     """Return the calibration of an arm with the values of a posterior that holds for all arms of its torso.
 
     Held-out errors remain those of the arm's own calibration, and so do the standard errors in its table.
     """
-    result, model, geometry = calibration.result, calibration.model, found.uncertainty.geometry
+    result, model, geometry = calibration.result, calibration.model, posterior.uncertainty.geometry
     own = geometric_result(result)
     solved = replace(
         own.solved, geometry=replace(geometry, setup=own.solved.setup, point=own.solved.geometry.point)
@@ -99,16 +99,16 @@ def with_common_joints(calibration: Calibration, found: ArmPosterior) -> Calibra
     updated = replace(result, geometric=common) if isinstance(result, HybridResult) else common
     robot = model.robot.with_geometry(base=geometry.robot.base, tool=geometry.robot.tool)
     text = (
-        f"{calibration.texts.description} Arms of one torso share its base and {', '.join(found.torso)}: their values "
-        "are from the rows of all these arms, held-out errors and standard errors in tables from the rows of this arm "
-        "only. There is no joint correction."
+        f"{calibration.card_texts.description} Arms of one torso share its base and {', '.join(posterior.torso)}: "
+        "their values are from the rows of all these arms, held-out errors and standard errors in tables from the "
+        "rows of this arm only. There is no joint correction."
     )
     summary = calibration.summary.with_figures(parameters=summarise(updated).parameters)
     return replace(
         calibration,
         result=updated,
         summary=summary,
-        texts=replace(calibration.texts, description=text),
+        card_texts=replace(calibration.card_texts, description=text),
         model=replace(
             model,
             robot=robot,
@@ -116,7 +116,7 @@ def with_common_joints(calibration: Calibration, found: ArmPosterior) -> Calibra
             calibrated=geometry.robot,
             bases=dict(geometry.bases),
             tools=dict(geometry.tools),
-            uncertainty=model.uncertainty and found.uncertainty.with_rounded_root(calibration.rows),
+            uncertainty=model.uncertainty and posterior.uncertainty.with_rounded_root(calibration.rows),
             metrics=summary.to_json(),
         ),
     )

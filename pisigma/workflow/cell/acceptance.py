@@ -46,7 +46,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
             f"the cell has no session of model '{entry.name}'", at=Place(cell.folder), remedy=remedy
         )
     new = known[-1]
-    seen = cell.sessions.rows_with_model_names(entry, cell.sessions.as_measured(new), new.day)
+    seen = cell.sessions.rows_with_model_names(entry, cell.sessions.rows_of_file(new), new.day)
     measured, problem = _measured(cell, entry, new, seen) if later else (None, _NO_SESSION)
     instrument = document.instrument or Instrument()
     repeats = tuple(
@@ -96,13 +96,13 @@ def _measured(
         return None, str(problem)
     errors = found.comparison.models[-1].position
     doubt = "" if not found.diagnostics else found.diagnostics[0].sentence
-    return MeasuredAccuracy(session.name, session.day, found.rows, seen.moved, errors, doubt), ""
+    return MeasuredAccuracy(session.name, session.day, found.rows, seen.changed_frames, errors, doubt), ""
 
 
 def _attained(
     cell: Cell, model: CalibratedModel, session: SessionEntry, seen: RowsWithModelNames | None
 ) -> tuple[Measurements, Float64[Tensor, "rows 3"] | None]:
     """Return the rows of a session and the commanded positions; None if the frames may have changed."""
-    if seen is None or seen.moved:
-        return cell.sessions.as_measured(session), None
+    if seen is None or seen.changed_frames:
+        return cell.sessions.rows_of_file(session), None
     return seen.rows, poses_of_rows(model, seen.rows)[:, :3, 3]

@@ -265,11 +265,11 @@ class Cell:
             MeasurementError: no session is newer than the model.
         """
         entry = self._candidate(None)
-        warnings, sessions = self.controller_warnings("monitor", entry), self.sessions.new_to(entry)
+        warnings, sessions = self.controller_warnings("monitor", entry), self.sessions.sessions_new_to(entry)
         found: MonitoringResult | None = None
         for one in sessions:
-            seen = self.sessions.rows_with_model_names(entry, self.sessions.as_measured(one), one.day)
-            moved = {"moved": ",".join(seen.moved)} if seen.moved else {}
+            seen = self.sessions.rows_with_model_names(entry, self.sessions.rows_of_file(one), one.day)
+            moved = {"moved": ",".join(seen.changed_frames)} if seen.changed_frames else {}
             settings = replace(
                 self.file.settings_of_step("monitor", **(moved | changed)), cameras=None, dates=(one.day,)
             )
@@ -334,7 +334,7 @@ class Cell:
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
-            events = unrecorded_changes(result, chosen, seen.moved, self.sessions.valid_sessions())
+            events = unrecorded_changes(result, chosen, seen.changed_frames, self.sessions.valid_sessions())
             added += [InUse(entry.name, now(), remark), *events]
         self.history.add(*added)
         return result, entry
@@ -391,9 +391,9 @@ class Cell:
         """Return a model, a session (by default the newest to which it was not fitted), and rows of the session."""
         entry = self._candidate(model)
         self.controller_warnings(command, entry)
-        chosen = self.sessions.choose(entry, session)
+        chosen = self.sessions.choose_session(entry, session)
         return (
             entry,
             chosen,
-            self.sessions.rows_with_model_names(entry, self.sessions.as_measured(chosen), chosen.day),
+            self.sessions.rows_with_model_names(entry, self.sessions.rows_of_file(chosen), chosen.day),
         )

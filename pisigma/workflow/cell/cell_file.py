@@ -12,7 +12,7 @@ from pydantic import Field
 
 from pisigma.files.errors import PisigmaError, Place, PlanningError
 from pisigma.files.scratch import FILE, scratch_beside
-from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
+from pisigma.files.setting import attribute_descriptions, build_settings, flat_settings, settings_by_key
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.files.yaml_writing import yaml_text
@@ -197,9 +197,8 @@ class CellFile:
             if step not in ("plan", "import"):
                 read.settings_of_step(step)
             else:
-                list(
-                    checked_values(read.stated_values(step), by_key(STEPS[step]), read._place(step).place_of)
-                )
+                values, settings = read.stated_values(step), settings_by_key(STEPS[step])
+                list(checked_values(values, settings, read._place(step).place_of))
         return read
 
     @property
@@ -211,7 +210,7 @@ class CellFile:
     def stated_values(self, step: str) -> dict[str, Any]:
         """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
-        known = by_key(STEPS[step])
+        known = settings_by_key(STEPS[step])
         shared: dict[str, Any] = {}
         if self.document.limit_mm is not None and "limit_mm" in STATED_ABOVE.get(step, ()):
             shared["limit_mm"] = self.document.limit_mm
@@ -275,33 +274,34 @@ class _Places:
 
 def settings_from(
     group: type[Group],
-    stated: Mapping[str, Any],
+    stated_values: Mapping[str, Any],
     places: _Places,
     folder: Path,
-    outside: Collection[str] = (),
+    keys_outside_cell: Collection[str] = (),
 ) -> Group:
     """Return an instance of a class of settings with the values of a file.
 
     Args:
         group: class of the settings.
-        stated: values by their keys, in the units of the command line.
+        stated_values: values by their keys, in the units of the command line.
         places: places of the keys in the file.
         folder: folder of the cell, to which paths are relative.
-        outside: keys whose paths are relative to the working directory.
+        keys_outside_cell: keys whose paths are relative to the working directory.
 
     Raises:
         PisigmaError: a key is unknown, or a value has the wrong type or is not valid.
     """
-    values = dict(
-        checked_values(stated, by_key(group), lambda key: None if key in outside else places.place_of(key))
-    )
+
+    def place_of(key: str) -> Place | None:
+        return None if key in keys_outside_cell else places.place_of(key)
+
+    values = dict(checked_values(stated_values, settings_by_key(group), place_of))
     try:
-        built = build_settings(group, dict(_with_paths(group, values, folder, outside)))
+        built = build_settings(group, dict(_with_paths(group, values, folder, keys_outside_cell)))
     except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
-        raise (
-            problem if key in outside else problem.with_place(places.place_of(key if key in values else ""))
-        ) from None
+        place = place_of(key if key in values or key in keys_outside_cell else "")
+        raise (problem if place is None else problem.with_place(place)) from None
     assert isinstance(built, group)
     return built
 
@@ -310,7 +310,7 @@ def _with_paths(
     group: type, values: Mapping[str, Any], folder: Path, outside: Collection[str]
 ) -> Iterator[tuple[str, Any]]:
     """Yield keys and values, with the full paths of files inside the cell."""
-    known = by_key(group)
+    known = settings_by_key(group)
     for key, value in values.items():
         if key not in outside and known[key].kind is Path:
             yield key, path_inside_cell(folder, value)
@@ -348,7 +348,7 @@ def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | No
         stated = {key: value for key, value in document.items() if value is not None}
         return yaml_text(stated | ({"calibrate": dict(calibrate)} if calibrate else {}))
     lines = ["# A cell: one robot on its mount, and its sensor. Lines that begin with # state defaults."]
-    meaning = {key: text.partition("; None")[0] for key, text in attributes_of(CellDocument).items()}
+    meaning = {key: text.partition("; None")[0] for key, text in attribute_descriptions(CellDocument).items()}
     known = (
         "robot",
         "base",
@@ -365,7 +365,7 @@ def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | No
         else:
             lines += textwrap.wrap(f"{key}:  # {meaning[key]}", _MAX_WIDTH, **_COMMENT)
     lines.append("# instrument:  # for the uncertainty budget of `pisigma report`; texts in quotation marks")
-    for key, text in attributes_of(Instrument).items():
+    for key, text in attribute_descriptions(Instrument).items():
         lines.append(f"#   {key}:  # {text}")
     if document.get("camera") is not None:
         lines += ["camera:", *(f"  {key}: {_yaml(value)}" for key, value in document["camera"].items())]

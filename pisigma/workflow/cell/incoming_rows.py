@@ -95,7 +95,7 @@ class IncomingRows:
         return len(self.files) == 1 and not stated and is_measurement_file(self.files[0])
 
     @cached_property
-    def imported(self) -> ImportedRows | None:
+    def imported_rows(self) -> ImportedRows | None:
         """Return the converted rows; None for a measurement file, which needs no conversion.
 
         Raises:
@@ -114,7 +114,7 @@ class IncomingRows:
 
     @property
     def _rows(self) -> Path | Measurements:
-        return self.files[0] if self.imported is None else self.imported.measurements
+        return self.files[0] if self.imported_rows is None else self.imported_rows.measurements
 
     def check(self, day: str = "") -> tuple[Diagnostic, ...]:
         """Check the rows as `Sessions.add` does, and return the findings.
@@ -190,7 +190,7 @@ def _corrected(mapping: FileMapping, finding: Diagnostic) -> Mapping[str, str]:
         for one in filter(None, map(mapping.quantities.get, names)):
             if (unit := _unit(one.target.unit, ratio)) is not None:
                 is_written = bool(_written(mapping, one))
-                targets.append((one, replace(one.target, unit=unit, overrides=is_written)))
+                targets.append((one, replace(one.target, unit=unit, overrides_unit=is_written)))
     return {mapping.key(one): target.text for one, target in targets}
 
 

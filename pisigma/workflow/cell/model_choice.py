@@ -33,8 +33,8 @@ Result = TypeVar("Result", bound=Calibration | Recalibration)
 
 
 def is_better(
-    stored: Sessions,
-    in_use: ModelEntry,
+    cell_sessions: Sessions,
+    model_in_use: ModelEntry,
     sessions: Sequence[SessionEntry],
     settings: CalibrationSettings,
     progress: Progress,
@@ -45,32 +45,42 @@ def is_better(
     confidence interval of the difference of the mean position errors is below 0.
 
     Args:
-        stored: the sessions of the cell.
-        in_use: the model in use.
+        cell_sessions: the sessions of the cell.
+        model_in_use: the model in use.
         sessions: sessions to which the new calibration was fitted, in the order of their days.
         settings: settings of the calibration.
         progress: called with the name of each step.
     """
-    newest, older, folder = sessions[-1], list(sessions[:-1]), stored.folder.parent / MODELS / in_use.name
-    if not is_unchanged(folder, in_use.sha256):
-        return False, f"model '{in_use.name}', which is in use, was changed or removed"
-    if newest.name in in_use.made_of or newest.rows < _MIN_ROWS or not older:
-        return False, f"there is no session of {_MIN_ROWS} rows or more to compare it with '{in_use.name}'"
+    newest, older, folder = (
+        sessions[-1],
+        list(sessions[:-1]),
+        cell_sessions.folder.parent / MODELS / model_in_use.name,
+    )
+    if not is_unchanged(folder, model_in_use.sha256):
+        return False, f"model '{model_in_use.name}', which is in use, was changed or removed"
+    if newest.name in model_in_use.made_of or newest.rows < _MIN_ROWS or not older:
+        return (
+            False,
+            f"there is no session of {_MIN_ROWS} rows or more to compare it with '{model_in_use.name}'",
+        )
     progress("calibration without the newest session")
     alone = replace(settings, cameras=None, folds=0, hold_out=None)
-    without = calibrate(stored.robot, stored.rows_of(older), alone)
-    events, day = stored.history.events(), older[-1].day
+    without = calibrate(cell_sessions.robot, cell_sessions.rows_of(older), alone)
+    events, day = cell_sessions.history.events(), older[-1].day
     entry = replace(
-        in_use,
+        model_in_use,
         day=day,
         frame_day=newest_day(events, "instrument", day),
         target_day=newest_day(events, "tool", day),
     )
-    rows = stored.as_measured(newest)
-    seen = [stored.rows_with_model_names(one, rows, newest.day) for one in (in_use, entry)]
+    rows = cell_sessions.rows_of_file(newest)
+    seen = [cell_sessions.rows_with_model_names(one, rows, newest.day) for one in (model_in_use, entry)]
     old = load_model(folder)
     judged = evaluate(
-        [replace(old, name="in use"), replace(with_setup_names_of(without.model, entry, in_use), name="new")],
+        [
+            replace(old, name="in use"),
+            replace(with_setup_names_of(without.model, entry, model_in_use), name="new"),
+        ],
         seen[0].rows,
         EvaluationSettings(
             fit_frame=any(one.fit_frame for one in seen), fit_tool=any(one.fit_tool for one in seen)
@@ -129,8 +139,8 @@ def check_entry(
         settings: settings of the recalibration.
     """
     check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
-    if monitoring.untrusted:
-        return replace(check, summary=monitoring.untrusted[0].sentence)
+    if monitoring.untrusted_sessions:
+        return replace(check, summary=monitoring.untrusted_sessions[0].sentence)
     judged = monitoring.sessions[-1].session
     check = replace(check, verdict=judged.verdict, summary=judged.sentence, rms_mm=judged.rms * 1e3)
     if judged.recalibrate or judged.verdict == "moved":
@@ -138,9 +148,9 @@ def check_entry(
     if session.rows < _MIN_ROWS:
         return check
     tried = recalibrate(monitoring.model, rows.rows, rows.settings_to_recalibrate(settings))
-    if not (tried.trusted and tried.gate.updates_model):
+    if not (tried.trusted and tried.candidate_choice.updates_model):
         return check
-    return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")
+    return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.candidate_choice.sentence}")
 
 
 def unrecorded_changes(
@@ -158,7 +168,7 @@ def unrecorded_changes(
     """
     if [one.day for one in valid].count(session.day) > 1:
         return []
-    moved = {one.split()[0] for one in (*result.summary.elsewhere, *(part.what for part in result.moved))}
+    moved = {one.split()[0] for one in (*result.summary.elsewhere, *(part.what for part in result.movements))}
     kinds: dict[str, EventKind] = {"base": "instrument", "tool": "tool"}
     note = f"found by the recalibration with session '{session.name}'"
     return [
@@ -177,14 +187,14 @@ def calibrate_rows(
     """
     if prior is None:
         result = calibrate(robot, rows, replace(settings, cameras=None), progress)
-        return replace(result, figures=result.summary.validation_errors is not None)
+        return replace(result, has_figures=result.summary.validation_errors is not None)
     settings.check_unused(WITH_PRIOR)
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 
 
 def model_entry(
     events: Sequence[Event],
-    made: str,
+    read_at: str,
     path: Path,
     sessions: Sequence[SessionEntry],
     remark: str,
@@ -195,7 +205,7 @@ def model_entry(
 
     Args:
         events: events that were recorded when the rows were read; a recalibrated model has the names of its parent.
-        made: time at which the rows were read (ISO 8601, UTC).
+        read_at: time at which the rows were read (ISO 8601, UTC).
         path: folder of the model.
         sessions: sessions to which the model was fitted.
         remark: reason why the model is or is not in use.
@@ -206,7 +216,7 @@ def model_entry(
     entry = ModelEntry(
         name=path.name,
         sha256=model_hash(path),
-        made=made,
+        made=read_at,
         sessions=",".join(one.name for one in sessions),
         day=day,
         frame_day=newest_day(events, "instrument", day),

@@ -34,7 +34,7 @@ from pisigma.validation.gate import RowVerdict, check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.cell.new_files import write_new
 from pisigma.workflow.cell.setup_names import RowsWithModelNames, newest_day, with_setup_names
-from pisigma.workflow.recalibrate import may_move
+from pisigma.workflow.recalibrate import allowed_moves
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 
@@ -152,7 +152,7 @@ class Sessions:
                 rows = read_rows(file, self.robot.without_limits, self.cameras)
             except MeasurementError:
                 raise refusal from None
-            if faults := check_rows(rows, self.robot).implausible:
+            if faults := check_rows(rows, self.robot).implausible_findings:
                 raise _untrusted(rows, faults) from refusal
             raise
 
@@ -176,9 +176,9 @@ class Sessions:
             model, verdict = None, check_rows(rows, self.robot)
         else:
             seen = self.rows_with_model_names(model, rows, day)
-            stated = RecalibrationSettings(seen.moved or None)
+            stated = RecalibrationSettings(seen.changed_frames or None)
             loaded = load_model(self._folder_of(model))
-            verdict = check_rows(seen.rows, loaded, stated.fitted, may_move(stated))
+            verdict = check_rows(seen.rows, loaded, stated.fitted, allowed_moves(stated))
             training = known_rows(loaded, seen.rows)
             fitted = bool(training.all())
             if not fitted:
@@ -190,8 +190,8 @@ class Sessions:
     ) -> tuple[SessionEntry, ModelEntry | None]:
         """Check rows; return the entry of their session without name and hash, and the model fitted to them."""
         verdict, found, model, fitted = self._verdict(rows, day)
-        if verdict.implausible and not accept_implausible:
-            raise _untrusted(rows, verdict.implausible)
+        if verdict.implausible_findings and not accept_implausible:
+            raise _untrusted(rows, verdict.implausible_findings)
         temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
         entry = SessionEntry(
             name="",
@@ -255,7 +255,7 @@ class Sessions:
             )
         return facts
 
-    def new_to(self, model: ModelEntry) -> list[SessionEntry]:
+    def sessions_new_to(self, model: ModelEntry) -> list[SessionEntry]:
         """Return the valid sessions to which a model was not fitted, measured on its newest day or later.
 
         Raises:
@@ -269,13 +269,13 @@ class Sessions:
             )
         return found
 
-    def choose(self, model: ModelEntry, name: str | None) -> SessionEntry:
+    def choose_session(self, model: ModelEntry, name: str | None) -> SessionEntry:
         """Return a session that is new to a model (see `new_to`), by name; None for the newest.
 
         Raises:
             MeasurementError: there is no session with this name.
         """
-        sessions = {one.name: one for one in self.new_to(model)}
+        sessions = {one.name: one for one in self.sessions_new_to(model)}
         name = [*sessions][-1] if name is None else name
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
@@ -295,13 +295,13 @@ class Sessions:
         events, parts = self.history.events() if events is None else events, []
         for one in sessions:
             days = newest_day(events, "instrument", one.day), newest_day(events, "tool", one.day)
-            parts.append(with_setup_names(self.as_measured(one), *days))
+            parts.append(with_setup_names(self.rows_of_file(one), *days))
         if any(one.split is not None for one in parts):
             # all rows of a session without a column "set" are for calibration
             parts = [one if one.split else replace(one, split=("train",) * one.rows) for one in parts]
         return parts[0] if len(parts) == 1 else read_rows(join(parts), self.robot)
 
-    def as_measured(self, session: SessionEntry) -> Measurements:
+    def rows_of_file(self, session: SessionEntry) -> Measurements:
         """Return the rows of a session with the frame and target names of their file.
 
         Raises:

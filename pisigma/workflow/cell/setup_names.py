@@ -15,11 +15,11 @@ class RowsWithModelNames:
 
     Attributes:
         rows: the rows, with the names of the newest frame and target of the model.
-        moved: "base" or "tool" or both, if events since the model was made record that these were changed.
+        changed_frames: "base" or "tool" or both, if events since the model was made record that these were changed.
     """
 
     rows: Measurements
-    moved: tuple[str, ...]
+    changed_frames: tuple[str, ...]
 
     def settings_to_fit(self, settings: Any) -> Any:
         """Return settings that also fit a changed frame and tool, without cameras, because rows are already read."""
@@ -28,18 +28,18 @@ class RowsWithModelNames:
 
     def settings_to_recalibrate(self, settings: RecalibrationSettings) -> RecalibrationSettings:
         """Return settings with the moved parts, unless stated; cameras are removed, because rows are already read."""
-        moved = (self.moved or None) if settings.moved is None else settings.moved
+        moved = (self.changed_frames or None) if settings.moved is None else settings.moved
         return replace(settings, cameras=None, moved=moved)
 
     @property
     def fit_frame(self) -> bool:
         """Whether the instrument was set up again."""
-        return "base" in self.moved
+        return "base" in self.changed_frames
 
     @property
     def fit_tool(self) -> bool:
         """Whether the tool was changed."""
-        return "tool" in self.moved
+        return "tool" in self.changed_frames
 
 
 def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:

@@ -160,13 +160,14 @@ class UpgradeResult:
 
     Attributes:
         models: results of the models.
-        before: version of the history's schema before the upgrade; equal to `after` if there was no history.
-        after: version of the history's schema after the upgrade.
+        schema_before: version of the history's schema before the upgrade; equal to `schema_after` if there was no
+            history.
+        schema_after: version of the history's schema after the upgrade.
     """
 
     models: tuple[Upgrade, ...]
-    before: int
-    after: int = SCHEMA_VERSION
+    schema_before: int
+    schema_after: int = SCHEMA_VERSION
 
 
 def upgrade(path: str | os.PathLike[str]) -> UpgradeResult:

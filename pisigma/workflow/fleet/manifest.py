@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pisigma.files.errors import FleetError, Phrase, PisigmaError, Place, nearest_choice
-from pisigma.files.setting import build_settings, by_key
+from pisigma.files.setting import build_settings, settings_by_key
 from pisigma.files.setting_values import read_assignments
 from pisigma.lifetime.cell.facts import sha256_of
 from pisigma.lifetime.cell.layout import SESSIONS, is_cell
@@ -196,7 +196,7 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
         )
     parts = [part.strip() for part in options.split(";") if part.strip()]
     try:
-        settings = read_assignments(parts, by_key(CalibrationSettings))
+        settings = read_assignments(parts, settings_by_key(CalibrationSettings))
         build_settings(CalibrationSettings, settings)
     except PisigmaError as problem:
         raise problem.with_place(replace(at, column="options"), FleetError) from None

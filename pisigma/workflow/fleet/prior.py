@@ -67,7 +67,7 @@ def estimate_fleet_prior(
         progress(f"{number} of {len(cells)} cells")
         try:
             cell = Cell.open(path)
-            some = cell.sessions.as_measured(cell.sessions.valid_sessions()[0]).split_sets()[0]
+            some = cell.sessions.rows_of_file(cell.sessions.valid_sessions()[0]).split_sets()[0]
             causes = [one for one in setup_diagnostics(cell.robot, some) if one.severity == "implausible"]
             if causes:  # a wrong unit would look like a large scatter between robots
                 raise FleetError(f"{some.source}: {causes[0].sentence}")

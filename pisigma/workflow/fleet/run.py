@@ -199,7 +199,7 @@ class FleetRun:
     seconds: float
 
     @property
-    def done(self) -> int:
+    def cells_done(self) -> int:
         """Number of cells that need no attention."""
         return self.cells - len(self.refused)
 
@@ -207,7 +207,7 @@ class FleetRun:
         """Return all figures as plain values."""
         return {
             "cells": self.cells,
-            "done": self.done,
+            "done": self.cells_done,
             "unchanged": self.unchanged,
             "refused": [{"cell": cell, "reason": reason} for cell, reason in self.refused],
             "seconds": round(self.seconds, 3),

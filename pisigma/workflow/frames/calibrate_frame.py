@@ -159,8 +159,8 @@ def calibrate_frame_of_cell(
         found = calibrate_frame(cell.robot, cell.sessions.rows_of([session]), only)
     else:
         cell.controller_warnings("calibrate", parent)
-        session = cell.sessions.choose(parent, None)
-        rows = cell.sessions.as_measured(session)
+        session = cell.sessions.choose_session(parent, None)
+        rows = cell.sessions.rows_of_file(session)
         seen = cell.sessions.rows_with_model_names(parent, rows, session.day)
         found = calibrate_frame(cell.model_folder(parent.name), seen.rows, only)
     doubt = "" if found.trusted else found.diagnostics[0].sentence

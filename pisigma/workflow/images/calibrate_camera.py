@@ -65,15 +65,15 @@ class CameraCalibration:
         tilts = np.rad2deg(self.calibration.tilts)
         return (
             *self.detection.sentences,
-            f"Corners are in {100 * self.calibration.covered.mean():.0f} % of the cells of the image; views are tilted "
-            f"by {np.median(tilts):.0f} deg (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
+            f"Corners are in {100 * self.calibration.covered_cells.mean():.0f} % of the cells of the image; views are "
+            f"tilted by {np.median(tilts):.0f} deg (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
         )
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return warnings, one sentence each."""
         calibration, warnings = self.calibration, list[str]()
-        empty = [name for name, cells in CORNERS.items() if not calibration.covered[cells].any()]
+        empty = [name for name, cells in CORNERS.items() if not calibration.covered_cells[cells].any()]
         if empty:
             warnings.append(
                 f"No corner of the board is in the {' and '.join(empty)} of the image, where the distortion is "
@@ -84,9 +84,9 @@ class CameraCalibration:
                 f"Most images are frontal (two thirds are tilted by less than {np.rad2deg(_OBLIQUE):.0f} deg), so "
                 "focal lengths can hardly be distinguished from distances; take images tilted by 20 to 40 deg."
             )
-        if calibration.disagrees:
+        if calibration.has_excess_scatter:
             warnings.append(
-                f"The images disagree about the camera by {calibration.disagreement:.2f} times the noise of "
+                f"The images disagree about the camera by {calibration.scatter_ratio:.2f} times the noise of "
                 "corners: the board is not flat, or the lens needs --set k3=true. Standard deviations are "
                 "enlarged by this factor, which does not cover errors common to all images; glue the board onto "
                 "something flat."
@@ -113,8 +113,8 @@ class CameraCalibration:
                 for name, value, sigma, unit in self.parameters
             ],
             "noise_px": calibration.noise,
-            "disagreement": calibration.disagreement,
-            "covered_share": float(calibration.covered.mean()),
+            "disagreement": calibration.scatter_ratio,
+            "covered_share": float(calibration.covered_cells.mean()),
             "tilts_deg": np.rad2deg(calibration.tilts).tolist(),
             **self.detection.to_json(),
             "sentences": list(self.sentences),
@@ -162,7 +162,7 @@ def calibrate_camera(
     """
     of_board = Board.load(board)
     detected = detect_boards(image_files(images), of_board, settings.max_blur, progress)
-    read = [one for one in detected if one.is_read]
+    read = [one for one in detected if one.is_readable]
     size = read[0].size
     for one in read:
         if one.size != size:
@@ -173,7 +173,7 @@ def calibrate_camera(
                 remedy="give images of one camera",
             )
     boards = [one.board for one in detected if isinstance(one.board, DetectedBoard)]
-    views = [BoardView(of_board.corners[one.corners], one.pixels) for one in boards]
+    views = [BoardView(of_board.corners[one.corner_numbers], one.pixels) for one in boards]
     calibration = calibrate_intrinsics(views, settings.name, size, settings.free_k3)
     return CameraCalibration(calibration, predict_boards(detected, calibration.camera, of_board))
 

@@ -52,12 +52,12 @@ class DetectedCorners:
     Attributes:
         detection: the boards in the images.
         joints: joint values of the images; None if there is no file of joint values.
-        names: names of the camera and of the board, for every row.
+        camera_and_board: names of the camera and of the board, for every row.
     """
 
     detection: DetectedBoards
     joints: JoinedJoints | None
-    names: tuple[str, str]
+    camera_and_board: tuple[str, str]
 
     @property
     def rows(self) -> list[list[str]]:
@@ -67,9 +67,9 @@ class DetectedCorners:
         for name, board in self.detection.boards.items():
             cells = () if self.joints is None else self.joints.cells.get(name)
             if cells is not None:
-                pairs = zip(board.corners.tolist(), board.pixels.tolist(), strict=True)
+                pairs = zip(board.corner_numbers.tolist(), board.pixels.tolist(), strict=True)
                 rows += [
-                    [name, *self.names, str(corner), f"{u:.4f}", f"{v:.4f}", *cells]
+                    [name, *self.camera_and_board, str(corner), f"{u:.4f}", f"{v:.4f}", *cells]
                     for corner, (u, v) in pairs
                 ]
         return rows
@@ -189,7 +189,7 @@ def names_images(path: str | os.PathLike[str]) -> bool:
 
 
 def join_joint_values(
-    names: Sequence[str], path: str | os.PathLike[str], within: float, stops: int = 0
+    names: Sequence[str], path: str | os.PathLike[str], max_time_difference: float, stops: int = 0
 ) -> JoinedJoints:
     """Return the joint values at which every image was taken.
 
@@ -197,7 +197,7 @@ def join_joint_values(
         names: names of the images without file extensions; they must be time stamps if the log has times.
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
-        within: largest difference of time stamps [s].
+        max_time_difference: largest difference of time stamps [s].
         stops: number of images that are numbered stops in a video, which must equal the number of rows of the file; 0
             if there is no video.
 
@@ -230,7 +230,7 @@ def join_joint_values(
         cells.pop("time", None)
     images = {"point": tuple(names)} | ({"time": tuple(map(_stamp, names))} if by == "time" else {})
     measured = ConvertedRows("the images", tuple(range(1, len(names) + 1)), images)
-    joined = join_rows(measured, ConvertedRows(table.source, table.lines, cells), by, within)
+    joined = join_rows(measured, ConvertedRows(table.source, table.lines, cells), by, max_time_difference)
     rows = joined.rows.cells
     columns = tuple(name for name in rows if find_column(name))
     others = [name for name in rows if name not in (*columns, *images)]
@@ -239,7 +239,7 @@ def join_joint_values(
     ]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))
-    remarks = (*sentences(joined.unmatched), *joined.warnings, *(unread if others else ()))
+    remarks = (*sentences(joined.unmatched_rows), *joined.warnings, *(unread if others else ()))
     return JoinedJoints(columns, of_image, remarks)
 
 

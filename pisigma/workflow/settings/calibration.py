@@ -18,36 +18,36 @@ _MAX_REPEATS = 1000
 ModelKind = Literal["hybrid", "geometric"]
 
 
-def parse_free_parameters(stated: str) -> str | tuple[str, ...]:
+def parse_free_parameters(text: str) -> str | tuple[str, ...]:
     """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names.
 
     Raises:
         IdentificationError: the text contains no name.
     """
-    if not stated.strip():
+    if not text.strip():
         raise IdentificationError(
-            expected="identifiable, joint_offsets or names of parameters", value=stated, option="free"
+            expected="identifiable, joint_offsets or names of parameters", value=text, option="free"
         )
-    return stated if stated in ("identifiable", "joint_offsets") else split_names(stated)
+    return text if text in ("identifiable", "joint_offsets") else split_names(text)
 
 
-def parse_direction(stated: str) -> tuple[float, ...]:
+def parse_direction(text: str) -> tuple[float, ...]:
     """Return the direction of gravity from "X,Y,Z"."""
     try:
-        numbers = tuple(map(float, stated.split(",")))
+        numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != 3:
         raise IdentificationError(
-            expected="three numbers X,Y,Z, such as 0,0,-1", value=stated, option="gravity"
+            expected="three numbers X,Y,Z, such as 0,0,-1", value=text, option="gravity"
         )
     return numbers
 
 
-def parse_socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
+def parse_socket_distances(texts: Iterable[str]) -> dict[tuple[str, str], float]:
     """Return known distances between pairs of sockets [m] from "A,B,MM" [mm]."""
     distances: dict[tuple[str, str], float] = {}
-    for one in stated:
+    for one in texts:
         sockets, distance = _socket_distance(one)
         if sockets in distances:
             raise IdentificationError(
@@ -195,11 +195,11 @@ class CalibrationSettings:
                 option="prior_length and prior_angle",
             )
 
-    def check_unused(self, by: str) -> None:
+    def check_unused(self, reason: str) -> None:
         """Refuse settings that another kind of calibration does not use.
 
         Args:
-            by: what that calibration does instead, as a clause.
+            reason: what that calibration does instead, as a clause.
 
         Raises:
             IdentificationError: a setting other than `cameras`, `jobs` and `folds` of 0 is stated.
@@ -209,7 +209,7 @@ class CalibrationSettings:
         )
         stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
         if stated:
-            raise IdentificationError(by, option=", ".join(stated), remedy="omit it")
+            raise IdentificationError(reason, option=", ".join(stated), remedy="omit it")
 
 
 WITH_PRIOR = (

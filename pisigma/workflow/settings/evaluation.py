@@ -43,7 +43,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         """Check that limits are positive and finite."""
-        for name, limit in self.stated.items():
+        for name, limit in self.stated_limits.items():
             if not (limit > 0 and math.isfinite(limit)):
                 unit = name.split("_")[1]
                 raise MeasurementError(
@@ -51,7 +51,7 @@ class Limits:
                 )
 
     @property
-    def stated(self) -> dict[str, float]:
+    def stated_limits(self) -> dict[str, float]:
         """The limits that are not None, by name."""
         return {name: limit for name, limit in asdict(self).items() if limit is not None}
 
@@ -66,7 +66,7 @@ class Limits:
         from pisigma.reporting.tables import figure_text
 
         sentences = []
-        for key, limit in self.stated.items():
+        for key, limit in self.stated_limits.items():
             option, what = _LIMITED[key]
             statistic, unit = key.split("_")
             errors = model.position if unit == "mm" else model.orientation
@@ -83,7 +83,7 @@ class Limits:
                 sentences.append(
                     f"the {what} of {model.name} is {text} {unit}; --{option} allows {limit:g} {unit}"
                 )
-        if self.stated and model.rows_not_predicted:
+        if self.stated_limits and model.rows_not_predicted:
             sentences.append(f"{model.name} predicts nothing for {model.rows_not_predicted} of the rows")
         return sentences
 

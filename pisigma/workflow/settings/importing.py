@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 _SIGNS = {"point": ".", "comma": ","}
 
 
-def parse_maps(stated: str) -> Sequence[Mapping[str, str]]:
+def parse_maps(text: str) -> Sequence[Mapping[str, str]]:
     """Return column mappings from text or from a file."""
     from pisigma.measurement.foreign.saved_map import parse_map
 
-    return parse_map(stated)
+    return parse_map(text)
 
 
-def parse_seconds(stated: str) -> float:
+def parse_seconds(text: str) -> float:
     """Return the seconds of a duration such as "0.2s" or "200ms"."""
-    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(s|ms)?\s*", stated)
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(s|ms)?\s*", text)
     if match is None:
-        raise MeasurementError(expected="a duration such as 0.2s or 200ms", value=stated, option="--within")
+        raise MeasurementError(expected="a duration such as 0.2s or 200ms", value=text, option="--within")
     return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
 
 

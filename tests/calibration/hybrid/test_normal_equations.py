@@ -46,7 +46,7 @@ def test_the_cases_are_what_they_are_for() -> None:
     """Sensors with one row, with two sides and with rows that count differently; columns that are not used."""
     values = {one.name: one for one in CASES["all kinds"]().rows.values}
     assert len(values["socket distance"].row) == 1
-    assert values["socket distance"].certain
+    assert values["socket distance"].is_stated
     assert len(values["pair"].row_derivatives) == 2
     assert len(poses().rows.values[0].weight_root.unique()) > 20
     assert not bool(poses().design.features[1].used.all())

@@ -55,8 +55,8 @@ def test_the_prior_improves_a_calibration_with_ten_poses(prior):
     with no_type_checker():
         begun = recalibrate(prior.model, few)
         without = calibrate(NOMINAL, few, CalibrationSettings(folds=0)).result
-    assert begun.gate.kept != "scratch"
-    assert begun.moved == ()
+    assert begun.candidate_choice.kept != "scratch"
+    assert begun.movements == ()
     assert rms(begun.adaptation.errors_of(test)) < 0.6 * rms(without.errors_of(test))
 
 
@@ -68,10 +68,10 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
         begun = recalibrate(prior.model, few)
         without = calibrate(NOMINAL, few, CalibrationSettings(folds=0))
         fewer = recalibrate(prior.model, few.select(torch.arange(8)))
-    assert begun.gate.kept == "scratch"
-    assert begun.gate.rms["scratch"] is None
+    assert begun.candidate_choice.kept == "scratch"
+    assert begun.candidate_choice.rms["scratch"] is None
     assert np.array_equal(begun.model.calibrated.dh, without.model.calibrated.dh)
-    assert fewer.gate.kept != "scratch"
+    assert fewer.candidate_choice.kept != "scratch"
     assert (
         fewer.summary.changed == FleetConsistency.from_rows(prior.model, few.select(torch.arange(8))).sentence
     )

@@ -60,7 +60,7 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
     assert [one.what for one in session.movements] == ["joint 3"]
     assert all(session.observable)
     assert_close(session.movements[0].shift, MOVED_DEG, atol=0.005)
-    assert [one.what for one in recalibrated.moved] == ["joint 3"]
+    assert [one.what for one in recalibrated.movements] == ["joint 3"]
     assert recalibrated.summary.kept == "recalibrated"
     found = recalibrated.model.uncertainty.noise
     assert found.is_factor("position") == (of_rows == "stated")
@@ -81,9 +81,7 @@ def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
 def test_checks_of_rows_use_the_stated_noise_of_any_source(models, of_model):
     with no_type_checker():
         usual = [
-            RowsUnderModel.from_rows(
-                models[of_model], rows_with(sigma, 12, 3), (), (), None
-            ).predicted_deviation
+            RowsUnderModel.from_rows(models[of_model], rows_with(sigma, 12, 3), (), (), None).predicted_sigma
             for sigma in KINDS.values()
         ]
     assert_close(usual[0], usual[1], rtol=0.1)

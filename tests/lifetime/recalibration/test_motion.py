@@ -35,8 +35,8 @@ def test_six_rows_in_another_frame_are_enough(collision):
     rows = rows_after_change(6, 11, COLLISION if collision else (0.0,) * 6, ELSEWHERE)
     verification = verify(original_model(), rows, VerificationSettings(fit_frame=True))
     assert verification.verdict == ("moved" if collision else "better")
-    assert [one.what for one in verification.motion.movements] == ["joint 3"] * collision
-    assert ("--moved base" in verification.recalibration) == collision
+    assert [one.what for one in verification.movements.movements] == ["joint 3"] * collision
+    assert ("--moved base" in verification.recalibration_command) == collision
     # fitted parameters, degrees of freedom, values, fitted parameters
     assert re.findall(r"\d+", verification.warnings[-1]) == ["6", "12", "18", "6"]
 
@@ -44,7 +44,7 @@ def test_six_rows_in_another_frame_are_enough(collision):
 def test_a_small_motion_of_the_base_is_a_warning():
     verification = verify(original_model(), rows_after_change(10, 6, base=(2e-4, -1e-4, 2e-4, 0.0, 0.0, 0.0)))
     assert verification.verdict == "better"
-    assert {one.what for one in verification.motion.movements} == {"base"}
+    assert {one.what for one in verification.movements.movements} == {"base"}
 
 
 def test_a_model_without_a_posterior_gives_no_session():

@@ -55,7 +55,7 @@ def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bo
     rows = read_rows(path, cell.nominal, replace(camera_files(tmp_path), is_fixed=is_fixed))
     assert (rows.frame[0], rows.target[0]) == (("wrist", "board") if is_fixed else ("board", "wrist"))
     assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
-    assert rows.place(1) == f"{path}, line {2 + len(cell.images.corners[0])}, image '0001'"
+    assert rows.place(1) == f"{path}, line {2 + len(cell.images.corner_numbers[0])}, image '0001'"
     assert torch.isfinite(approach_by_order(rows)[1:]).all()
     assert torch.isnan(approach_by_order(rows.select(torch.tensor([0, 2])))).all()
     rows.write_csv(tmp_path / "rows.csv", cell.nominal)

@@ -21,7 +21,7 @@ def bent_images(cell: CameraCell, noise: float) -> Images:
     corners, rng = bent_corners(BOARD, BENT), np.random.default_rng(0)
     T = invert(forward_kinematics(cell.true, cell.images.q)).numpy()
     pixels = []
-    for pose, number in zip(T, cell.images.corners, strict=True):
+    for pose, number in zip(T, cell.images.corner_numbers, strict=True):
         exact = CAMERA.project(corners[number] @ pose[:3, :3].T + pose[:3, 3])[0]
         pixels.append(exact + noise * rng.standard_normal(exact.shape))
     return replace(cell.images, pixels=tuple(pixels))

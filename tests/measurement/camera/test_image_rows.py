@@ -102,14 +102,14 @@ def test_the_result_warns_that_the_board_sets_the_scale() -> None:
 def test_corners_of_another_board_are_refused() -> None:
     images = camera_cell(8, 0, EXACT).images
     shuffled = [
-        torch.randperm(len(one), generator=torch.Generator().manual_seed(0)) for one in images.corners
+        torch.randperm(len(one), generator=torch.Generator().manual_seed(0)) for one in images.corner_numbers
     ]
     mixed = type(images)(
         images.source,
         images.names,
         images.q,
         images.lines,
-        tuple(one[order.numpy()] for one, order in zip(images.corners, shuffled, strict=True)),
+        tuple(one[order.numpy()] for one, order in zip(images.corner_numbers, shuffled, strict=True)),
         images.pixels,
     )
     with refused(MeasurementError, file=images.source, line=images.lines[0]) as caught:

@@ -50,7 +50,7 @@ def test_deviations_are_those_of_the_errors(calibration: IntrinsicCalibration) -
     assert 0.5 < np.sqrt(np.square(errors).mean()) < 1.6
     assert (calibration.camera.k3, sigma[8]) == (0.0, 0.0)
     assert_close(calibration.noise, NOISE, rtol=0.1)
-    assert 0.3 < calibration.covered.mean() < 1.0
+    assert 0.3 < calibration.covered_cells.mean() < 1.0
 
 
 def test_exact_corners_give_the_camera_and_opencv_agrees_on_others() -> None:
@@ -69,10 +69,10 @@ def test_exact_corners_give_the_camera_and_opencv_agrees_on_others() -> None:
 
 def test_a_bowed_board_makes_images_disagree(calibration: IntrinsicCalibration) -> None:
     bowed = calibrate_intrinsics(views(8, 0.6, bow=1e-3), "wrist", SIZE)
-    assert not calibration.disagrees
-    assert_close(calibration.disagreement, 1.0, atol=0.2)
-    assert bowed.disagrees
-    assert bowed.disagreement > 1.5
+    assert not calibration.has_excess_scatter
+    assert_close(calibration.scatter_ratio, 1.0, atol=0.2)
+    assert bowed.has_excess_scatter
+    assert bowed.scatter_ratio > 1.5
 
 
 def test_a_focal_length_in_closed_form() -> None:

@@ -18,7 +18,7 @@ from pisigma.measurement.camera.board_pose import BoardPose, solve_board_pose
 from pisigma.measurement.camera.camera import USUAL_DEVIATIONS, Camera
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.measurement.camera.image_rows import Images, image_measurements
-from pisigma.measurement.camera.solved_images import prior_deviations, solve_images
+from pisigma.measurement.camera.solved_images import prior_sigmas, solve_images
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.sensors.intrinsics import intrinsics_information
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -31,7 +31,7 @@ def poses_of(images: Images) -> Callable[[Camera], list[BoardPose]]:
     """Return a function that solves the poses of some images."""
     return lambda camera: [
         solve_board_pose(camera, BOARD.corners[corners], pixels, SquaredLoss())
-        for corners, pixels in zip(images.corners, images.pixels, strict=True)
+        for corners, pixels in zip(images.corner_numbers, images.pixels, strict=True)
     ]
 
 
@@ -54,32 +54,32 @@ def test_the_reduced_equations_are_those_of_the_complete_least_squares_problem()
     turned, point_jacobian = BOARD.corners @ pose.R.T, CAMERA.project(points)[1]
     A = np.concatenate([point_jacobian, np.cross(turned[:, None], point_jacobian)], -1).reshape(-1, 6)
     left = B - A @ np.linalg.lstsq(A, B, rcond=None)[0]
-    assert_close(pose.root.T @ pose.root, left.T @ left, rtol=1e-5, atol=1e-3)
+    assert_close(pose.information_root.T @ pose.information_root, left.T @ left, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("choice", ["prior", "free"])
 def test_images_correct_intrinsics(choice: str) -> None:
     deviations = np.array(USUAL_DEVIATIONS) * (1 if choice == "prior" else 20)
     wrong = CAMERA.with_intrinsics(CAMERA.intrinsics + deviations)
-    sigma = prior_deviations(wrong, choice)
+    sigma = prior_sigmas(wrong, choice)
     solved = solve_images(wrong, sigma, poses_of(camera_cell(30).images), SquaredLoss(), "images")
     root, mean = intrinsics_information(solved.intrinsics)
     assert np.linalg.norm(root @ (CAMERA.intrinsics - mean)) < 5.0  # of eight standard normal numbers
     assert_close(solved.noise, 0.3, rtol=0.05)
-    assert np.abs(root @ (mean - solved.present.intrinsics)).max() < 0.1
+    assert np.abs(root @ (mean - solved.camera_of_poses.intrinsics)).max() < 0.1
 
 
 def test_intrinsics_with_zero_deviation_are_fixed() -> None:
-    assert not prior_deviations(CAMERA, "fixed").any()
-    assert_close(prior_deviations(CAMERA, "prior"), np.array(USUAL_DEVIATIONS))
+    assert not prior_sigmas(CAMERA, "fixed").any()
+    assert_close(prior_sigmas(CAMERA, "prior"), np.array(USUAL_DEVIATIONS))
     stated = replace(CAMERA, sigma=(1.0, *[0.0] * 8))
-    assert prior_deviations(stated, "free").nonzero()[0].tolist() == [0]
+    assert prior_sigmas(stated, "free").nonzero()[0].tolist() == [0]
 
 
 def test_impossible_intrinsics_are_refused() -> None:
     (pose,) = poses_of(camera_cell(1).images)(CAMERA)
-    pulled = replace(pose, root=np.eye(9), residual=np.full(9, -1e6))
-    sigma = prior_deviations(CAMERA, "free")
+    pulled = replace(pose, information_root=np.eye(9), residual=np.full(9, -1e6))
+    sigma = prior_sigmas(CAMERA, "free")
     with refused(MeasurementError, file="x", value="wrist"):
         solve_images(CAMERA, sigma, lambda camera: [pulled], SquaredLoss(), "x")
 

@@ -24,7 +24,7 @@ def test_lines_around_the_rows(tmp_path: Path):
     assert file.units == ("", "mm", "mm")
     assert file.records == [["p1", "1,5", "2,5"], ["p2", "-", "3,5"]]
     assert file.lines == (7, 9)
-    assert [row.line for row in file.skipped] == [11]
+    assert [row.line for row in file.skipped_lines] == [11]
     assert file.comments[:2] == ("Report of 2 March", "// units mm")
 
 

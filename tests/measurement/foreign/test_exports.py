@@ -69,10 +69,10 @@ def test_points_joined_by_time_stamps():
 
 
 def test_cells_keep_their_digits():
-    header, first, *_ = imported("kuka.csv").content.text().splitlines()
+    header, first, *_ = imported("kuka.csv").measurement_table.text().splitlines()
     assert header.split(",")[8:10] == ["z_mm", "roll_deg"]
     assert (
         first
         == "10.500,-90.000,90.000,0.000,45.250,-179.125,-29.789,632.883,-86.260,114.655874,-38.090496,-44.347675"
     )
-    assert "-29.789,632.883,-86.260" in imported("ur_rtde.csv").content.text()
+    assert "-29.789,632.883,-86.260" in imported("ur_rtde.csv").measurement_table.text()

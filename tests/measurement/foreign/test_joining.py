@@ -28,11 +28,11 @@ def test_names_differ_in_groups_case_and_zeros():
     assert joined.rows.cells["q1_deg"] == ("10", "20")
     assert joined.rows.cells["x_mm"] == ("1", "2")
     assert joined.rows.lines == (2, 3)
-    assert [(row.file, row.line, row.point) for row in joined.unmatched] == [
+    assert [(row.file, row.line, row.point) for row in joined.unmatched_rows] == [
         ("points", 4, "p9"),
         ("log", 4, "p3"),
     ]
-    assert "line 4 (p9)" in sentences(joined.unmatched)[0]
+    assert "line 4 (p9)" in sentences(joined.unmatched_rows)[0]
     (warning,) = joined.warnings
     assert warning.startswith("log: roll_deg ")
     assert joined.rows.cells["payload_kg"] == ("2", "1")
@@ -62,7 +62,7 @@ def test_the_nearest_time_stamp_is_joined():
     log = rows("log", time=("10:00:02.1", "10:00:01.0", "10:00:05"), q1_deg=("20", "10", "50"))
     joined = join_rows(measured, log, "time", 0.2)
     assert joined.rows.cells["q1_deg"] == ("10", "20")
-    assert [(row.file, row.line) for row in joined.unmatched] == [("points", 4), ("log", 4)]
+    assert [(row.file, row.line) for row in joined.unmatched_rows] == [("points", 4), ("log", 4)]
     with refused(MeasurementError, file="points and log", expected="time stamps within 0.2 s of each other"):
         join_rows(rows("points", time=("11:00:02.1",), x_mm=("1",)), log, "time", 0.2)
 
@@ -75,7 +75,7 @@ def test_recordings_whose_times_restart_are_refused_if_they_overlap():
         (replace(log, cells={"x_mm": log.cells["q1_deg"]} | log.cells), log),
     ):
         with refused(MeasurementError, file="log", line=5):
-            join_rows(first, second, "time", within=0.2)
+            join_rows(first, second, "time", max_time_difference=0.2)
     later = rows("log", time=("5.0", "6.0", "1.0", "2.0"), q1_deg=("5", "6", "1", "2"))
     assert join_rows(measured, later, "time").rows.cells["q1_deg"] == ("1", "2")
 

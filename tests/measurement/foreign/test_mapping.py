@@ -147,7 +147,7 @@ def test_commanded_values_are_not_measurements(tmp_path: Path):
         "y_mm",
         "z_mm",
     ]
-    assert not mapped(tmp_path, "j1 [deg],j2 [deg],x nom,y nom,z nom\n1,2,3,4,5\n").has_measured
+    assert not mapped(tmp_path, "j1 [deg],j2 [deg],x nom,y nom,z nom\n1,2,3,4,5\n").has_measured_values
 
 
 @pytest.mark.parametrize("joints", [6, 7])

@@ -30,7 +30,7 @@ def imported(
     path.write_text("\n".join(",".join(row) for row in ([names] if names else []) + rows) + "\n")
     result = import_rows([path], settings)
     for file in result.accounts:
-        assert file.read == file.used + len(file.left_out)
+        assert file.rows_read == file.rows_used + len(file.left_out)
     return result
 
 
@@ -227,7 +227,7 @@ def test_a_commanded_centre_is_not_a_mean(tmp_path: Path):
 def test_unambiguous_dates_are_read_in_any_order(tmp_path: Path):
     for first, second in (("13/02/2026", "1/2/2026"), ("13.02.2026 10:31", "01.02.26"), ("2026-02-13", "")):
         rows = column([first] * 11 + [second], 9)(measured())
-        days = [row[9] for row in imported(tmp_path, rows, [*NAMES, "Date"]).content.table.records]
+        days = [row[9] for row in imported(tmp_path, rows, [*NAMES, "Date"]).measurement_table.table.records]
         assert days == ["2026-02-13"] * 11 + (["2026-02-01"] if second else [""])
     with refused(MeasurementError, line=2, column="Date", value="02/03/2026"):
         imported(tmp_path, column(["02/03/2026"] * 12, 9)(measured()), [*NAMES, "Date"])
@@ -256,14 +256,17 @@ def test_lines_of_numbers_around_the_table_are_listed(tmp_path: Path):
 def test_a_stated_first_column_does_not_change_the_order_of_others(tmp_path: Path):
     settings = ImportSettings(units="mm,deg", maps=({"1": "time_s"},))
     result = imported(tmp_path, column(TIMES)(measured()), None, settings)
-    assert result.content.table.header[0] == "q1_deg"
-    assert result.content.table.records == measured()
+    assert result.measurement_table.table.header[0] == "q1_deg"
+    assert result.measurement_table.table.records == measured()
     last = ImportSettings(units="mm,deg", maps=({"10": "time_s"},))
-    assert imported(tmp_path, column(TIMES, 9)(measured()), None, last).content.table.records == measured()
+    assert (
+        imported(tmp_path, column(TIMES, 9)(measured()), None, last).measurement_table.table.records
+        == measured()
+    )
     seven = imported(
         tmp_path, column(TIMES)(measured()), None, ImportSettings(units="mm,deg", maps=({"1": "q1_deg"},))
     )
-    assert seven.content.table.header[6] == "q7_deg"
+    assert seven.measurement_table.table.header[6] == "q7_deg"
 
 
 def test_a_joint_that_moves_in_steps_is_not_a_time(tmp_path: Path):

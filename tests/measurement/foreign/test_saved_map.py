@@ -5,7 +5,7 @@ from pathlib import Path
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.saved_map import check_used, map_for, parse_map
+from pisigma.measurement.foreign.saved_map import check_headings_exist, map_for, parse_map
 
 
 def test_mappings_of_a_command_line():
@@ -30,7 +30,7 @@ def test_mappings_of_a_file(tmp_path: Path):
 
 
 def test_a_heading_that_no_file_has_is_refused():
-    check_used(({"1": "q1_deg", "X": "x_mm"},), [("X", "Y")])
+    check_headings_exist(({"1": "q1_deg", "X": "x_mm"},), [("X", "Y")])
     with refused(MeasurementError, option="--map", value="A1") as caught:
-        check_used(({"A1": "q1_deg"},), [("X", "Y")])
+        check_headings_exist(({"A1": "q1_deg"},), [("X", "Y")])
     assert "'X', 'Y'" in caught.value.remedy

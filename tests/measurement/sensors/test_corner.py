@@ -22,7 +22,7 @@ from pisigma.measurement.sensors.intrinsics import without_stated_priors
 
 def test_derivatives_are_those_of_the_weighted_errors() -> None:
     cell = camera_cell(8)
-    board = replace(BOARD, scale_deviation=1e-3)
+    board = replace(BOARD, scale_sigma=1e-3)
     data = image_measurements(cell.images, CAMERA, board, False, Repeatability())
     setup = GeometricCalibrator(cell.nominal).build(data)
     problem, everything, rows = setup.problem, torch.arange(len(setup.start)), slice(0, 8)
@@ -95,7 +95,7 @@ def test_priors_that_a_model_includes_are_not_counted_again() -> None:
     calibrator = GeometricCalibrator(camera_cell(8).nominal)
     before, after = (calibrator.build(rows).problem for rows in (images, counted))
     first, second = (
-        problem.sensors[1].root[:8, :8, 0] for problem in (before, after)
+        problem.sensors[1].information_root[:8, :8, 0] for problem in (before, after)
     )  # U^T U is the information on fx to p2
     prior = (first.T @ first - second.T @ second) / torch.as_tensor(images.readings["corner_noise"])[0] ** 2
     assert_close(prior.diagonal(), 1 / torch.tensor(USUAL_DEVIATIONS[:8]).double().square(), rtol=1e-4)

@@ -52,7 +52,7 @@ class Inclinometer(AbstractSensor):
     name = "tilt"
     unit = "rad"
     components = 2
-    turning = True
+    depends_on_rotation = True
     readings = SensorReadings(
         "tilt",
         (ReadingColumn("tilt_x", ("deg", "rad")), ReadingColumn("tilt_y", ("deg", "rad"))),

@@ -53,7 +53,7 @@ def lines(plan: StoredPlan) -> list[str]:
     true = robot.with_geometry(robot.dh + errors, base=base, tool=robot.tool + 2e-3)
     camera, board = Camera.load(settings.camera), Board.load(settings.board)
     images = simulate_images(true, plan.q, camera, board, ImageNoise(), torch.Generator().manual_seed(0))
-    assert all(len(corners) == CORNERS for corners in images.corners)
+    assert all(len(corners) == CORNERS for corners in images.corner_numbers)
     text = corner_lines(images)
     first = 1 + CORNERS * SWAPPED
     joints = text[first + CORNERS].split(",")[4:]
@@ -64,7 +64,7 @@ def lines(plan: StoredPlan) -> list[str]:
 
 def test_an_image_is_complete_when_the_next_one_starts(plan: StoredPlan, lines: list[str], tmp_path: Path):
     file = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings)
-    assert "does not exist" in file.read().waiting
+    assert "does not exist" in file.read().missing_part
     (tmp_path / "corners.csv").write_text("\n".join(lines[: 1 + CORNERS]) + "\n")
     assert file.read().rows is None
     faulty = [line.replace(",", ",5", 1) for line in lines[1 + CORNERS : 1 + 2 * CORNERS]]
@@ -76,7 +76,7 @@ def test_an_image_is_complete_when_the_next_one_starts(plan: StoredPlan, lines: 
     (left_out,) = growth.left_out
     assert left_out.line == 2 + CORNERS + 4
     assert "column 'corner'" in left_out.reason
-    last = file.read(final=True)
+    last = file.read(is_complete=True)
     assert last.rows is not None
     assert last.rows.line == (2 + 2 * CORNERS,)
     assert not last.left_out
@@ -85,7 +85,7 @@ def test_an_image_is_complete_when_the_next_one_starts(plan: StoredPlan, lines: 
 def test_a_session_finds_swapped_joints_and_the_accuracy(plan: StoredPlan, lines: list[str], tmp_path: Path):
     session = MeasuringSession(plan, MeasureSettings(replan=False))
     (tmp_path / "corners.csv").write_text("\n".join(lines) + "\n")
-    growth = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings).read(final=True)
+    growth = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings).read(is_complete=True)
     with no_type_checker():
         session.add(growth.rows, growth.left_out)
         session.update()

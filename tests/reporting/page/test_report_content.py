@@ -18,9 +18,9 @@ from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.reporting.page.content import causes_of, report_content
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_at
+from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_position_sigma
 from pisigma.validation.held_out.validation_figures import ErrorFigures
-from pisigma.validation.report.accuracy import limit_of
+from pisigma.validation.report.accuracy import accuracy_limit
 from pisigma.validation.report.corrections import correction_curves, joint_gaps, measured_intervals
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -35,7 +35,7 @@ def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
     arm, model = hybrid
     rows = measured(arm, 150, seed=9)
     content = report_content(model, tmp_path, rows)
-    assert content.rows.origin == "other"
+    assert content.rows.row_origin == "other"
     first = content.accuracies[0]
     assert (first.origin, first.held_out, first.rows) == ("file", True, 150)
     assert list(first.models) == ["nominal", "geometric", "hybrid"]
@@ -62,7 +62,7 @@ def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
 def test_rows_of_the_calibration_are_recognised_by_their_hash(hybrid, tmp_path):
     arm, model = hybrid
     content = report_content(model, tmp_path, arm.measurements)
-    assert content.rows.origin == "training"
+    assert content.rows.row_origin == "training"
     own = content.accuracies[-1]
     assert own.origin == "training"
     assert not own.held_out
@@ -82,7 +82,7 @@ def test_joint_values_measured_again_are_reported(hybrid, tmp_path):
     arm, model = hybrid
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
-    assert content.rows.origin == "other"
+    assert content.rows.row_origin == "other"
     assert any("200 of 200" in line for line in content.rows.repeated_row_warnings)
     assert set(content.rows.repeated_row_warnings) < set(content.remarks)
 
@@ -93,11 +93,11 @@ def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
     training = report_content(model, tmp_path, arm.measurements).rows
     for rows in (arm.measurements, None):
         content = report_content(kept, tmp_path / "arm", rows)
-        assert content.rows.origin == "held_out"
-        assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=6e-5)
+        assert content.rows.row_origin == "held_out"
+        assert_close(content.rows.model_errors.position, 1.1 * training.model_errors.position, rtol=6e-5)
         assert content.correlations.tables
     other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
-    assert other.rows.origin == "other"
+    assert other.rows.row_origin == "other"
 
 
 def test_a_model_in_another_frame_is_worse_than_nominal(hybrid, tmp_path):
@@ -120,7 +120,7 @@ def test_rows_marked_as_train_are_left_out(hybrid, tmp_path):
 def test_errors_per_frame_and_target(tmp_path):
     arm, model = hybrid_under_test(frames=True)
     content = report_content(model, tmp_path, arm.measurements)
-    names = content.frames.names
+    names = content.frames.name_errors
     assert [one.name for one in names] == ["wall", "floor"]
     assert sum(one.rows for one in names) == 200
     error = content.rows.residual.norm(dim=-1).numpy() * 1e3
@@ -129,7 +129,7 @@ def test_errors_per_frame_and_target(tmp_path):
     assert_close(names[0].bias, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9, atol=1e-12)
     assert 0 < content.frames.p <= 1
     assert content.frames.largest.after == max(one.after for one in names)
-    assert len(content.targets.names) == 2
+    assert len(content.targets.name_errors) == 2
 
 
 def test_rows_in_sockets_are_compared_with_the_mean_of_the_socket(hybrid, tmp_path):
@@ -141,7 +141,7 @@ def test_rows_in_sockets_are_compared_with_the_mean_of_the_socket(hybrid, tmp_pa
     expected = torch.cat([ball[:4].mean(0) - ball[:4], ball[4:8].mean(0) - ball[4:8]])
     assert_close(content.rows.residual[:8], expected, atol=1e-12)
     assert bool(torch.isnan(content.rows.residual[8]).all())
-    assert content.rows.unknown == 1
+    assert content.rows.rows_without_error == 1
     assert any("1 of 9 rows" in line for line in content.remarks)
 
 
@@ -157,7 +157,7 @@ def test_the_workspace_is_shown_without_rows(hybrid, tmp_path):
     assert content.rows is None
     assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
     assert len(content.map.position) == 3000
-    assert (content.map.rows, content.map.random) == (0, 3000 - len(hybrid[1].starts))
+    assert (content.map.rows, content.map.random_points) == (0, 3000 - len(hybrid[1].starts))
     assert content.missing
     assert content.dependences == ()
 
@@ -168,7 +168,7 @@ def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
     assert list(content.accuracies[0].models) == ["nominal", "geometric"]
     assert content.curves == ()
     assert len(content.missing) == 1  # no predicted accuracy
-    assert (content.limit.noise, content.limit.scatter_share) == (None, None)
+    assert (content.limit.scatter, content.limit.scatter_share) == (None, None)
     assert content.summary == CalibrationSummary.read(model)
 
 
@@ -207,18 +207,18 @@ def test_repeated_rows_show_the_scatter(hybrid, tmp_path):
     assert limit.source == "repeats"
     values = content.rows.residual.numpy().reshape(4, 60, 3)
     pooled = ((values - values.mean(0)) ** 2).sum() / (240 - 60)
-    assert_close(limit.noise, math.sqrt(pooled) * 1e3, rtol=1e-12)
-    assert_close(limit.noise, math.sqrt(3) * 0.1, rtol=0.1)
+    assert_close(limit.scatter, math.sqrt(pooled) * 1e3, rtol=1e-12)
+    assert_close(limit.scatter, math.sqrt(3) * 0.1, rtol=0.1)
 
 
 def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
     model = hybrid[1]
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
-    limit = limit_of(model, CalibrationSummary.read(model), accuracy, None)
-    assert_close(limit.noise, math.sqrt(3) * sigma, rtol=1e-12)
-    larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.noise)})
-    limit = limit_of(model, CalibrationSummary.read(model), larger, None)
+    limit = accuracy_limit(model, CalibrationSummary.read(model), accuracy, None)
+    assert_close(limit.scatter, math.sqrt(3) * sigma, rtol=1e-12)
+    larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.scatter)})
+    limit = accuracy_limit(model, CalibrationSummary.read(model), larger, None)
     assert_close(limit.scatter_share, 0.25, rtol=1e-12)
     assert (limit.source, limit.is_mostly_scatter) == ("hybrid", False)
 
@@ -227,16 +227,16 @@ def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
     model = hybrid[1]
     accuracy = report_content(model, tmp_path).accuracies[0]
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
-    limit = limit_of(model, CalibrationSummary.read(model), smaller, None)
-    assert limit.noise > 1e-3
+    limit = accuracy_limit(model, CalibrationSummary.read(model), smaller, None)
+    assert limit.scatter > 1e-3
     assert limit.scatter_share is None
-    assert limit.error == 1e-3
+    assert limit.rms_error == 1e-3
 
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
     arm, model = hybrid
     monkeypatch.setattr("pisigma.validation.held_out.judged_rows.MAX_PREDICTED", 20)
-    found = predicted_at(model, arm.measurements)
+    found = predicted_position_sigma(model, arm.measurements)
     assert int(torch.isfinite(found).sum()) == 20
     assert MAX_PREDICTED > 20
     assert bool(torch.isfinite(found[[0, -1]]).all())
@@ -249,7 +249,7 @@ def test_curves_are_the_correction_at_the_middle_row(hybrid):
     q, curve = model.starts, curves[2]
     with torch.no_grad():
         seen = model.hybrid.correction(q)[:, 2].numpy() * math.degrees(1e3)
-    assert_close(curve.dots, seen, rtol=1e-12)
+    assert_close(curve.row_corrections, seen, rtol=1e-12)
     assert curve.measured.any()
 
 
@@ -313,7 +313,7 @@ def test_a_distilled_model_is_compared_with_its_parent(tmp_path):
     first = content.accuracies[0]
     assert (first.origin, first.rows, first.source) == ("poses", 77, "whole")
     assert content.limit.is_approximation
-    assert content.verdict.limit == "Reach: less."
+    assert content.verdict.limiting_cause == "Reach: less."
     assert content.joints == ()
 
 
@@ -322,7 +322,7 @@ def test_a_report_names_one_first_cause(hybrid, tmp_path):
     rows = measured(hybrid[0], 60, seed=9)
     fault = Diagnostic(kind="setup_fault", severity="implausible", sentence="Joint 2 counts the other way.")
     content = report_content(hybrid[1], tmp_path, rows, diagnostics=(fault,))
-    assert content.verdict.limit == content.advice[0] == content.remarks[0] == fault.sentence
+    assert content.verdict.limiting_cause == content.advice[0] == content.remarks[0] == fault.sentence
     assert content.to_json()["limit"]["summary"] == fault.sentence
     plain = report_content(hybrid[1], tmp_path, rows)
     assert len(content.verdict.sentence) < len(plain.verdict.sentence)

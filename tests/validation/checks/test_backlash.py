@@ -168,7 +168,7 @@ def test_residuals_of_several_files_are_in_the_order_of_their_lines():
     two = join([rows.select(torch.arange(50)), replace(rows.select(torch.arange(50, 100)), source="b.csv")])
     shuffled = two.select(torch.randperm(100, generator=torch.Generator().manual_seed(1)))
     ordered = OrderedRows.from_result(GeometricCalibrator(robot).fit(shuffled))
-    sorted_q = shuffled.q[torch.from_numpy(ordered.number)]
+    sorted_q = shuffled.q[torch.from_numpy(ordered.row_index)]
     first = rows.q[:50] if shuffled.origin[0] == "rows.csv" else rows.q[50:]
     assert_close(sorted_q[:50], first, atol=0.0)
 

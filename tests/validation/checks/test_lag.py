@@ -27,7 +27,7 @@ def test_a_lag_is_found_with_its_size(name, before):
     (found,) = check_lag(check)
     assert (found.kind, found.severity) == ("lag", "implausible")
     lag = find_lag(OrderedRows.from_result(check.geometric), rows)
-    assert lag.before == before
+    assert lag.logged_before_arrival == before
     assert_close(lag.motion_fraction, SHARE, rtol=0.15)
 
 

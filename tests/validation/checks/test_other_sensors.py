@@ -21,7 +21,7 @@ def test_moved_tool_is_found_by_touches_about_one_axis_or_all(axis):
     frames = {"bases": {"": robot.base}, "tools": {"": robot.tool}}
     model = replace(geometric_model("ur10"), robot=robot, calibrated=robot, **frames)
     rows = touches(touching_joints(8, axis=axis), random_noise(8, 1))
-    (found,) = check_rows(rows, model).implausible
+    (found,) = check_rows(rows, model).implausible_findings
     assert found.cause == "tool"
     left, moved = _fitted(model, rows, range(6, 9))
     assert left < 2e-4

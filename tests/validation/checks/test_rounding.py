@@ -36,7 +36,7 @@ def test_rounded_joint_values_are_named_with_their_step_and_error(name, degrees)
     step = np.where(arm.robot.revolute, np.deg2rad(degrees), degrees * 1e-3)
     assert_close(rounding.steps, step)
     moved = arm.true.tip(arm.q)[0] - arm.true.tip(rows.q.numpy())[0]
-    assert_close(rounding.error, np.sqrt(np.square(moved).sum(1).mean()), rtol=0.15)
+    assert_close(rounding.rms_error, np.sqrt(np.square(moved).sum(1).mean()), rtol=0.15)
 
 
 @pytest.mark.parametrize("name", ARMS)

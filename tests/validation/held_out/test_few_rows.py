@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.few_rows import fit_if_better
-from pisigma.validation.held_out.trained_calibrations import base_and_tool
+from pisigma.validation.held_out.trained_calibrations import base_and_tool_calibrator
 
 
 def nothing(what: str) -> None:
@@ -29,7 +29,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
         chosen = torch.from_numpy(rng.permutation(rows.rows))
         few, others = rows.select(chosen[:count]), rows.select(chosen[-200:])
         with no_type_checker():
-            results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
+            results = (fit_if_better(calibrator, few, nothing), base_and_tool_calibrator(calibrator).fit(few))
             fitted, nominal = (pose_errors_of(result, others).figures.rms_mm for result in results)
         ratios.append(fitted / nominal)
     assert max(ratios) <= 1.05
@@ -51,6 +51,6 @@ def test_ten_positions_of_an_arm_with_clear_errors_are_fitted():
     few, others = rows.select(torch.arange(10)), rows.select(torch.arange(10, 110))
     calibrator = GeometricCalibrator(arm.nominal)
     with no_type_checker():
-        results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
+        results = (fit_if_better(calibrator, few, nothing), base_and_tool_calibrator(calibrator).fit(few))
         fitted, nominal = (pose_errors_of(result, others).figures.rms_mm for result in results)
     assert fitted < 0.2 * nominal

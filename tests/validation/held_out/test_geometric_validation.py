@@ -20,7 +20,7 @@ from pisigma.validation.held_out.calibration_validation import validate
 from pisigma.validation.held_out.trained_calibrations import (
     DistanceErrors,
     assign_distances_to_folds,
-    with_frames,
+    with_missing_frames,
 )
 
 KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
@@ -153,7 +153,7 @@ def test_a_frame_that_is_fitted_afterwards_leaves_the_arm_as_it_was() -> None:
     right = torch.tensor([name == "right" for name in data.frame])
     arm = exact()
     result = arm.fit(data.select(right.nonzero()[:, 0]))
-    both = with_frames(arm, result, data.select((~right).nonzero()[:, 0]))
+    both = with_missing_frames(arm, result, data.select((~right).nonzero()[:, 0]))
     assert both.robot is result.robot
     assert sorted(both.bases) == ["left", "right"]
     assert_close(both.bases["left"][:3], TRUE_BASES["left"][:3], atol=1e-7)

@@ -41,7 +41,7 @@ def _kept(
     """The file of held-out rows, and the model whose metrics hold its hash."""
     held_out = HeldOutRows.from_validation(validation, measured)
     text = held_out.to_csv(model.robot)
-    metrics = bare_summary(held_out_rows=held_out.hashes(text)).to_json()
+    metrics = bare_summary(held_out_rows=held_out.compute_hashes(text)).to_json()
     return text, replace(model, kind="geometric_calibration", metrics=metrics)
 
 

@@ -16,7 +16,7 @@ from pisigma.measurement.splits import holdout, k_folds
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import judge, learning_curve, validate
 from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread, predicted_spread
-from pisigma.validation.held_out.trained_calibrations import with_frames
+from pisigma.validation.held_out.trained_calibrations import with_missing_frames
 
 ROWS = 240
 
@@ -81,7 +81,7 @@ def test_means_over_the_parts(found):
 def test_coverage_counts_coordinates_within_their_intervals(found):
     validation, _, _ = found
     spread = validation.spread
-    assert spread.values == 3 * ROWS
+    assert spread.value_count == 3 * ROWS
     inside = spread.error.abs() <= 1.96 * spread.sigma
     assert_close(spread.coverage, float(inside.double().mean()), atol=1e-12)
     assert 0.88 <= spread.coverage <= 0.995
@@ -93,7 +93,7 @@ def test_coverage_of_errors_drawn_as_predicted(generator):
     error = sigma * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
     error[::7], sigma[1::7] = torch.nan, torch.nan
     spread = PredictedSpread(error, sigma)
-    assert spread.values < 12000
+    assert spread.value_count < 12000
     assert_close(spread.coverage, 0.95, atol=0.01)
     assert_close(PredictedSpread(0.5 * error, sigma).coverage, 1.0, atol=1e-3)
     assert PredictedSpread.all_nan(5).in_file_units() == {}
@@ -146,10 +146,10 @@ def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
     assert found.frames_fitted == 1
     rms = {name: errors.rms_mm for name, errors in found.figures().models.items()}
     assert rms["hybrid"] < 0.7 * rms["geometric"]
-    assert found.spread.values == 0  # nothing is predicted of where a frame is that was not seen
+    assert found.spread.value_count == 0  # nothing is predicted of where a frame is that was not seen
     calibrator = small(arm.true.nominal)
     result = calibrator.fit(named.select(part[0]))
-    both = with_frames(calibrator.geometric_calibrator, result, named.select(part[1]))
+    both = with_missing_frames(calibrator.geometric_calibrator, result, named.select(part[1]))
     for known in (both.geometric.bases, both.learned.geometry.bases):
         assert list(known) == ["left", "right"]
         assert_close(known["right"], known["left"], atol=2e-3)  # it is the same place

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, rank_correlation, signed_rank
+from pisigma.validation.held_out.rank_tests import SIGNIFICANT, kruskal_wallis, rank_correlation, signed_rank
 
 
 def test_signed_rank_by_hand():
@@ -43,7 +43,7 @@ def test_rank_correlation_is_that_of_the_ranks():
 
 def test_groups_differ_by_hand():
     # ranks 1 2 3 against 4 5 6: H = 12 / (6 · 7) · (6² / 3 + 15² / 3) - 3 · 7
-    H, chance = groups_differ(np.array([5, 5, 5, 9, 9, 9]), np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
+    H, chance = kruskal_wallis(np.array([5, 5, 5, 9, 9, 9]), np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     assert_close(H, 12 / 42 * (36 / 3 + 225 / 3) - 21, atol=1e-12)
     assert_close(chance, math.erfc(math.sqrt(H / 2)), atol=1e-12)
 
@@ -51,5 +51,5 @@ def test_groups_differ_by_hand():
 @pytest.mark.parametrize("x", [np.ones(9), np.arange(2.0)])
 def test_nothing_to_compare_is_chance(x):
     assert rank_correlation(x, np.arange(float(len(x)))) == (0.0, 1.0)
-    assert groups_differ(np.zeros(9, dtype=int), np.arange(9.0)) == (0.0, 1.0)
-    assert groups_differ(np.arange(9) % 2, np.ones(9)) == (0.0, 1.0)
+    assert kruskal_wallis(np.zeros(9, dtype=int), np.arange(9.0)) == (0.0, 1.0)
+    assert kruskal_wallis(np.arange(9) % 2, np.ones(9)) == (0.0, 1.0)

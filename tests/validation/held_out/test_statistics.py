@@ -111,7 +111,7 @@ def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
         assert_close(figures["rms"], np.sqrt((values**2).mean()), rtol=1e-8)
         assert_close(figures["p95"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
         assert_close(figures["max"], np.abs(values).max(), rtol=1e-8)
-    some = errors.sizes.mask_other_rows(torch.tensor([True, False] * 3))
+    some = errors.to_pose_errors.mask_other_rows(torch.tensor([True, False] * 3))
     assert torch.equal(some.position.isnan(), torch.tensor([False, True] * 3))
     assert torch.equal(some.rotation.isnan(), torch.tensor([False, True] * 3))
 

@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.validation.iso9283.pose import position_accuracy, position_repeatability
-from pisigma.validation.iso9283.repeats import MIN_CYCLES, pooled_deviation, repeated_poses
+from pisigma.validation.iso9283.repeats import MIN_CYCLES, pooled_scatter, repeated_poses
 
 GENERATOR = torch.Generator().manual_seed(3)
 Q = torch.randn(3, 6, generator=GENERATOR, dtype=torch.float64)
@@ -24,7 +24,7 @@ def test_poses_that_were_measured_more_than_once_have_figures():
         attained, commanded = ATTAINED[number == POSE], COMMANDED[number == POSE][0]
         assert_close(one.accuracy, float(position_accuracy(attained, commanded).length))
         assert one.repeatability is None
-    s, freedom = pooled_deviation(found)
+    s, freedom = pooled_scatter(found)
     assert freedom == 9
     parts = [ATTAINED[number == POSE] - ATTAINED[number == POSE].mean(0) for number in (0, 1)]
     assert_close(s, float((torch.cat(parts).square().sum() / 9).sqrt()), rtol=1e-9)
@@ -41,10 +41,10 @@ def test_the_repeatability_needs_ten_cycles():
 def test_scatter_is_unbiased_with_two_cycles():
     q = torch.arange(2_000.0, dtype=torch.float64).repeat_interleave(2)[:, None].expand(-1, 6)
     attained = 1e-4 * torch.randn(4_000, 3, generator=GENERATOR, dtype=torch.float64)
-    s, freedom = pooled_deviation(repeated_poses(Measurements(q=q, position=attained), None))
+    s, freedom = pooled_scatter(repeated_poses(Measurements(q=q, position=attained), None))
     assert freedom == 6_000
     assert_close(s, 1e-4, rtol=0.03)
-    assert pooled_deviation(()) is None
+    assert pooled_scatter(()) is None
 
 
 def test_poses_that_were_commanded_half_a_milliradian_apart_are_not_repeats():

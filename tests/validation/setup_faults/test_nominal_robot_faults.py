@@ -43,7 +43,7 @@ def arm():
 def test_faults_are_named(arm, name, kind):
     (fault,) = find_nominal_robot_faults(arm.nominal, MISTAKES[name].change(arm.measurements, arm.nominal))
     assert fault.kinds == (kind,)
-    assert fault.after < 3 * usual_error(arm.nominal, arm.measurements.q) < fault.before
+    assert fault.rms_after < 3 * usual_error(arm.nominal, arm.measurements.q) < fault.rms_before
     assert fault.explains_orientation == (kind not in ("position_unit",))
 
 

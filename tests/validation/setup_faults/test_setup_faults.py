@@ -149,7 +149,7 @@ def assert_fault(fault: SetupFault, kinds: tuple[str, ...], fields: dict[str, An
     assert fault.kinds == kinds
     assert fault.joints == fields.get("joints", ())
     if "moved" in fields:
-        assert_close(fault.moved, fields["moved"], atol=1e-3)
+        assert_close(fault.largest_zero_shift, fields["moved"], atol=1e-3)
     if "amounts" in fields:
         assert_close(fault.amounts, fields["amounts"], rtol=1e-3)
 
@@ -162,9 +162,9 @@ def test_faults_are_recognised(geometric, name):
         model, nominal_model(model, False), spoil(rows, poses_of_rows(model, rows))
     )
     assert_fault(setup_fault, kinds, fields)
-    assert setup_fault.before > 20 * setup_fault.after
-    assert_close(setup_fault.after, NOISE * 3**0.5, rtol=0.3)
-    assert setup_fault.after_nominal > 3 * setup_fault.after
+    assert setup_fault.rms_before > 20 * setup_fault.rms_after
+    assert_close(setup_fault.rms_after, NOISE * 3**0.5, rtol=0.3)
+    assert setup_fault.nominal_rms_after > 3 * setup_fault.rms_after
 
 
 @pytest.mark.parametrize("name", ["frame and tool", "a sign"])
@@ -173,7 +173,7 @@ def test_faults_are_recognised_in_poses(geometric, name):
     spoil, kinds, fields = FAULTS[name]
     (setup_fault,) = find_setup_faults(model, model, spoil(rows, poses_of_rows(model, rows)))
     assert_fault(setup_fault, kinds, fields)
-    assert setup_fault.after_rotation < 1e-3 < setup_fault.before_rotation
+    assert setup_fault.rotation_rms_after < 1e-3 < setup_fault.rotation_rms_before
     assert {"before_rms_deg", "after_rms_deg"} <= set(setup_fault.to_json())
 
 

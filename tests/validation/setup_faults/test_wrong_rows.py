@@ -40,7 +40,7 @@ def spoilt(rows, shift=0.0, turn=0.0, wrong=(WRONG,)):
 def test_a_row_that_is_far_off_is_named(arm, model, shift, turn, fitted):
     found = without_wrong_rows([model], spoilt(arm.measurements, shift, turn), fitted)
     assert found.rows.rows == arm.measurements.rows - 1
-    assert (found.indices, len(found.warnings)) == ((WRONG,), 1)
+    assert (found.wrong_row_indices, len(found.warnings)) == ((WRONG,), 1)
 
 
 def test_rows_of_usual_errors_and_many_wrong_ones_are_all_judged(arm, model):
@@ -54,6 +54,6 @@ def test_rows_of_usual_errors_and_many_wrong_ones_are_all_judged(arm, model):
 def test_one_of_few_rows_is_named_if_nothing_is_fitted(arm, model, shift, turn):
     rows = spoilt(arm.measurements, shift, turn).select(torch.arange(2, 10))
     found = without_wrong_rows([model], rows)
-    assert found.indices == (WRONG - 2,)
-    assert without_wrong_rows([model], rows, ("base", "tool")).indices == ()
-    assert without_wrong_rows([model], rows.select(torch.arange(3, 8))).indices == ()
+    assert found.wrong_row_indices == (WRONG - 2,)
+    assert without_wrong_rows([model], rows, ("base", "tool")).wrong_row_indices == ()
+    assert without_wrong_rows([model], rows.select(torch.arange(3, 8))).wrong_row_indices == ()

@@ -17,7 +17,7 @@ def budget(*components):
 def test_the_end_gauge_of_the_gum():
     """JCGM 100:2008, H.1: 32 nm with 16 effective degrees of freedom, and k = 2.92 for 99 %."""
     gauge = budget((25e-9, 18), (9.7e-9, 25.6), (2.9e-9, 50), (16.6e-9, 2))
-    assert round(gauge.combined * 1e9) == 32
+    assert round(gauge.combined_uncertainty * 1e9) == 32
     assert math.floor(gauge.effective_degrees_of_freedom) == 16
     assert_close(stats.t.ppf(0.995, math.floor(gauge.effective_degrees_of_freedom)), 2.92, atol=0.005)
 
@@ -27,18 +27,18 @@ def test_the_combined_figures_are_those_of_the_formulas():
     found = budget(*zip(u.tolist(), freedom.tolist(), strict=True))
     combined = np.linalg.norm(u)
     effective = combined**4 / np.sum(u**4 / freedom)
-    assert_close(found.combined, combined, rtol=1e-12)
+    assert_close(found.combined_uncertainty, combined, rtol=1e-12)
     assert_close(found.effective_degrees_of_freedom, effective, rtol=1e-12)
     assert_close(found.coverage_factor, stats.t.ppf(0.975, effective), rtol=1e-12)
-    assert_close(found.expanded, found.coverage_factor * combined, rtol=1e-12)
+    assert_close(found.expanded_uncertainty, found.coverage_factor * combined, rtol=1e-12)
 
 
 def test_exact_components_have_the_factors_of_the_normal_distribution():
     found = budget((0.03, math.inf), (0.04, None))
     assert found.effective_degrees_of_freedom == math.inf
-    assert_close(found.combined, 0.05, rtol=1e-12)
+    assert_close(found.combined_uncertainty, 0.05, rtol=1e-12)
     assert_close(found.coverage_factor, 1.959964, atol=1e-6)
-    assert_close(found.radius / found.combined, 2.795483, atol=1e-6)
+    assert_close(found.coverage_radius / found.combined_uncertainty, 2.795483, atol=1e-6)
     assert found.to_json()["effective_degrees_of_freedom"] == "infinite"
 
 
@@ -49,8 +49,8 @@ def test_coordinates_and_positions_are_covered(freedom):
     estimated = np.sqrt(rng.chisquare(freedom, 100_000) / freedom)
     errors = rng.normal(size=(100_000, 3))
     one = budget((1.0, freedom))
-    assert_close(np.mean(np.abs(errors[:, 0]) < one.expanded * estimated), 0.95, atol=0.004)
-    assert_close(np.mean(np.linalg.norm(errors, axis=1) < one.radius * estimated), 0.95, atol=0.004)
+    assert_close(np.mean(np.abs(errors[:, 0]) < one.expanded_uncertainty * estimated), 0.95, atol=0.004)
+    assert_close(np.mean(np.linalg.norm(errors, axis=1) < one.coverage_radius * estimated), 0.95, atol=0.004)
 
 
 def test_without_components_there_are_no_combined_figures():

@@ -118,8 +118,8 @@ def test_the_expanded_uncertainty_covers_true_errors():
             budget = uncertainty_budget(model, at, "new poses", stated, {}, (), None)
             error = new - poses_of_rows(model, at)[:, :3, 3]
         assert all(isinstance(one, Component) and one.standard_uncertainty > 0 for one in budget.components)
-        covered.append(float((error.abs() < budget.expanded).double().mean()))
-        within.append(float((error.norm(dim=1) < budget.radius).double().mean()))
+        covered.append(float((error.abs() < budget.expanded_uncertainty).double().mean()))
+        within.append(float((error.norm(dim=1) < budget.coverage_radius).double().mean()))
     assert 0.92 < np.mean(covered) < 0.985
     assert 0.92 < np.mean(within) < 0.985
 

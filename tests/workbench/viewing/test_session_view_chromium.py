@@ -15,7 +15,7 @@ from pisigma.planning.session.state import Advice, Alarm
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
-from pisigma.workbench.viewing.session_view import SessionView, first_view, top_of_scale
+from pisigma.workbench.viewing.session_view import SessionView, color_scale_maximum, first_view
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +92,8 @@ def test_nothing_is_printed_to_stdout(capfd):
 
 def test_the_colour_scale_covers_the_used_rows():
     state = session_state(arm_with_tracker(), 20, wrong=19)
-    assert_close(top_of_scale(state.rows), 5e-4, rtol=1e-12)
-    assert_close(top_of_scale(session_state(arm_with_tracker(), 3).rows), 1e-3)
+    assert_close(color_scale_maximum(state.rows), 5e-4, rtol=1e-12)
+    assert_close(color_scale_maximum(session_state(arm_with_tracker(), 3).rows), 1e-3)
 
 
 def test_the_first_view_contains_robot_and_tracker():

@@ -55,9 +55,9 @@ def test_what_is_stated_is_in_the_budget(cell):
     assert found.instrument.serial == "0012"
     u = [one.standard_uncertainty for one in found.budget.components]
     assert_close(u[2], 0.015e-3, rtol=1e-12)
-    assert_close(found.budget.combined, math.sqrt(sum(one**2 for one in u)))
+    assert_close(found.budget.combined_uncertainty, math.sqrt(sum(one**2 for one in u)))
     assert (found.measured.session, found.measured.rows) == ("2026-06-01", 10)
-    assert found.measured.errors.statistics["p95"] < found.budget.radius * 1e3
+    assert found.measured.errors.statistics["p95"] < found.budget.coverage_radius * 1e3
     assert not found.contradicted
 
 

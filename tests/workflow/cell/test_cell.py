@@ -204,7 +204,7 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     assert again.settings.fit_frame
     assert again.verdict == "better"
     older = cell.add_session(measured(12, 5), day="2026-01-12")
-    assert cell.sessions.rows_with_model_names(entry, cell.sessions.as_measured(older), older.day).fit_frame
+    assert cell.sessions.rows_with_model_names(entry, cell.sessions.rows_of_file(older), older.day).fit_frame
     cell.history.record("mastering", "2026-02-10")
     assert cell.status().step.state == "no_plan"
     with refused(MeasurementError):

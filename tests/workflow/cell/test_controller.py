@@ -150,7 +150,7 @@ def test_rows_before_and_after_a_change_of_the_joint_zeros_are_not_one_session(c
     dates = tuple(day(4) if row < 5 else day(2) for row in range(10))
     cell.add_session(pisigma.Measurements(q=rows.q, position=rows.position, date=dates))
     with refused(MeasurementError, value="controller"):
-        cell.sessions.as_measured(cell.history.sessions()[-1])
+        cell.sessions.rows_of_file(cell.history.sessions()[-1])
 
 
 def test_a_file_that_was_edited_is_not_known(cell, used, tmp_path):

@@ -72,7 +72,7 @@ def test_a_mistake_is_named_and_the_settings_that_correct_it(cell, tmp_path, mis
         with pytest.raises(AcceptanceError) as refusal:
             incoming.add()
         assert repair.options in refusal.value.remedy
-        corrected = IncomingRows((file,), cell, repair.settings).imported.measurements
+        corrected = IncomingRows((file,), cell, repair.settings).imported_rows.measurements
     right = rows if mistake == "moved" else measured(30, 0)
     assert_close(corrected.q, right.q, atol=1e-12)
     assert_close(corrected.position, right.position, atol=1e-12)

@@ -131,7 +131,7 @@ def residual_sizes(
     """Compute the length of every row's residual per component [m]; NaN if no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
     for sensor, part in zip(problem.sensors, sensor_view_of(linearisation).contributions, strict=True):
-        if sensor.unit == "m" and not sensor.certain:
+        if sensor.unit == "m" and not sensor.is_stated:
             size = part.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)
     return sizes

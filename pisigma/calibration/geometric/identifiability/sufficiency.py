@@ -163,7 +163,7 @@ def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[Calibra
 
 def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
     """Yield a warning if all targets are too near to the last axis and only positions were measured."""
-    if any(sensor.turning for sensor in problem.sensors) or robot.joints[-1].type != "revolute":
+    if any(sensor.depends_on_rotation for sensor in problem.sensors) or robot.joints[-1].type != "revolute":
         return []
     last = robot.joint_rows[-1]
     names, offs = [], []

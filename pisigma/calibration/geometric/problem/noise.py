@@ -144,7 +144,7 @@ def loss_scale(
     """
     scales = []
     for k, sensor in enumerate(sensors):
-        if sensor.certain:
+        if sensor.is_stated:
             scales.append(torch.ones_like(effective_parameters[k]))
             continue
         distance = view.contributions[k].distance
@@ -199,7 +199,7 @@ def group_variance_ratio(
     for k, (sensor, part) in enumerate(zip(sensors, view.contributions, strict=True)):
         ratio = torch.ones_like(effective_parameters[k])
         ratios.append(ratio)
-        if sensor.certain:
+        if sensor.is_stated:
             continue
         weight = loss.weight(part.distance / view.scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
@@ -239,8 +239,8 @@ def angle_disagreement(
         prior_precision: prior precision of every free parameter.
         prior_gradient: contribution of the prior to the right-hand side of the normal equations.
     """
-    angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
-    lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
+    angular = [sensor.unit == "rad" and not sensor.is_stated for sensor in sensors]
+    lengths = [sensor.unit != "rad" and not sensor.is_stated for sensor in sensors]
     if not any(angular) or not any(lengths):
         return torch.ones_like(view.noise)
     variance = view.noise.square() * view.repeat_variance_factor

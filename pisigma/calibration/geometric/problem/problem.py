@@ -241,7 +241,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def loss_for_sensor(self, sensor: AbstractSensor) -> AbstractLoss:
         """Return the loss function of a sensor."""
-        return _CERTAIN_LOSS if sensor.certain else self.loss
+        return _CERTAIN_LOSS if sensor.is_stated else self.loss
 
     def chunks(self) -> list[slice]:
         """Return the rows in chunks that are processed together."""
@@ -333,7 +333,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     @cached_property
     def needs_rotation(self) -> bool:
         """Whether any sensor requires the rotation of the tool."""
-        return any(sensor.turning for sensor in self.sensors)
+        return any(sensor.depends_on_rotation for sensor in self.sensors)
 
     @cached_property
     def _prior(self) -> Float64[Tensor, " active"]:

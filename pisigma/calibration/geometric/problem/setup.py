@@ -195,7 +195,7 @@ def setup_from_guess(
         pose=number_repeats(repeats, frame, target),
         configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
         pair_count=len(set(measurements.pair or ()) - {""}),
-        stated_conditions=JointState.from_measurements(measurements).stated,
+        stated_conditions=JointState.from_measurements(measurements).conditions,
         prior_scaling=options.prior_scaling,
     )
     free = [

@@ -18,7 +18,7 @@ from pisigma.deployment.export.controllers.controller_file import (
 from pisigma.deployment.export.joint_offsets import joints_by_axes
 from pisigma.files.errors import Phrase, Place, RobotError
 from pisigma.files.input_file import read_text
-from pisigma.files.yaml_file import plain_content
+from pisigma.files.yaml_file import parse_plain_yaml
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
 from pisigma.robot.row import Row
@@ -147,7 +147,7 @@ def _csv_entries(text: str) -> list[Mapping[str, object]]:
 
 
 def _yaml_entries(text: str, source: str) -> list[Mapping[str, object]]:
-    content = plain_content(text, RobotError, source)
+    content = parse_plain_yaml(text, RobotError, source)
     joints = content.get("joints") if isinstance(content, dict) else None
     if not isinstance(joints, list) or not all(isinstance(joint, dict) for joint in joints):
         raise RobotError(

@@ -49,11 +49,11 @@ class DetectedBoard:
     """The corners of a board in an image.
 
     Attributes:
-        corners: numbers of the corners, see `Board`.
+        corner_numbers: numbers of the corners, see `Board`.
         pixels: u and v of every corner [px].
     """
 
-    corners: Int64[np.ndarray, " corners"]
+    corner_numbers: Int64[np.ndarray, " corners"]
     pixels: Float64[np.ndarray, "corners 2"]
 
 
@@ -75,7 +75,7 @@ class NoBoard:
 def edge_pixels(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
     """Return the pixels of both ends of all edges of the board between detected corners [px]."""
     pixels = np.full((len(board.corners), 2), np.nan)
-    pixels[detected.corners] = detected.pixels
+    pixels[detected.corner_numbers] = detected.pixels
     ends = pixels[board.edges]
     shown: np.ndarray = ends[np.isfinite(ends).all((1, 2))]
     return shown
@@ -104,7 +104,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     inside = (np.abs(pixels - np.array(image.shape[::-1]) / 2) < np.array(image.shape[::-1]) / 2 - half).all(
         1
     )
-    corners, pixels = detected.corners[inside], pixels[inside]
+    corners, pixels = detected.corner_numbers[inside], pixels[inside]
     axes = _axes_of_squares(board.corners[corners, :2] / board.square, pixels)
     if axes is not None:
         pixels = fit_saddles(image.astype(np.float64), pixels, axes, _WINDOW * board.clearance)
@@ -129,13 +129,13 @@ class EdgeProfiles:
 
     Attributes:
         points: crossing points on every edge [px].
-        across: normal vectors of the edges, with half the sampled width as length [px].
-        profile: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
+        normals: normal vectors of the edges, with half the sampled width as length [px].
+        gray_values: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
     """
 
     points: Float64[np.ndarray, "edges crossings 2"]
-    across: Float64[np.ndarray, "edges 2"]
-    profile: Float64[np.ndarray, "edges crossings samples"]
+    normals: Float64[np.ndarray, "edges 2"]
+    gray_values: Float64[np.ndarray, "edges crossings samples"]
 
     @staticmethod
     def from_image(image: Image, ends: Float64[np.ndarray, "edges 2 2"], clearance: float) -> "EdgeProfiles":
@@ -167,8 +167,8 @@ class EdgeProfiles:
         The area between a step from 0 to 1 and the step blurred with the standard deviation σ is `σ sqrt(2/π)`. Motion
         blurs only the edges across it, so the third quartile of all edges is returned.
         """
-        missing = np.where(_ACROSS < 0, self.profile, 1 - self.profile).mean((1, 2))
-        blur = 2 * np.linalg.norm(self.across, axis=1) * missing / np.sqrt(2 / np.pi)
+        missing = np.where(_ACROSS < 0, self.gray_values, 1 - self.gray_values).mean((1, 2))
+        blur = 2 * np.linalg.norm(self.normals, axis=1) * missing / np.sqrt(2 / np.pi)
         return float(np.nanquantile(blur, 0.75)) if np.isfinite(blur).any() else np.nan
 
     @property
@@ -177,8 +177,8 @@ class EdgeProfiles:
 
         Edges without contrast keep their position.
         """
-        offset = np.nan_to_num(1 - 2 * self.profile.mean(2))
-        points: np.ndarray = self.points + offset[..., None] * self.across[:, None]
+        offset = np.nan_to_num(1 - 2 * self.gray_values.mean(2))
+        points: np.ndarray = self.points + offset[..., None] * self.normals[:, None]
         return points
 
 

@@ -38,7 +38,7 @@ class BoardImage:
         return self.file.stem
 
     @property
-    def is_read(self) -> bool:
+    def is_readable(self) -> bool:
         """Whether the file is a complete image."""
         return self.size != (0, 0)
 
@@ -49,11 +49,11 @@ class DetectedBoards:
 
     Attributes:
         images: all images, in the order of the files.
-        predicted: predicted pixels [px] of the corners of every image with a board, by image name.
+        predicted_pixels: predicted pixels [px] of the corners of every image with a board, by image name.
     """
 
     images: tuple[BoardImage, ...]
-    predicted: dict[str, Float64[np.ndarray, "_corners 2"]]
+    predicted_pixels: dict[str, Float64[np.ndarray, "_corners 2"]]
 
     @property
     def boards(self) -> dict[str, DetectedBoard]:
@@ -68,7 +68,7 @@ class DetectedBoards:
     @property
     def residuals(self) -> dict[str, Float64[np.ndarray, "_corners 2"]]:
         """Detected minus predicted pixels [px] by image name."""
-        return {name: board.pixels - self.predicted[name] for name, board in self.boards.items()}
+        return {name: board.pixels - self.predicted_pixels[name] for name, board in self.boards.items()}
 
     @property
     def rms(self) -> float:
@@ -80,7 +80,7 @@ class DetectedBoards:
     def sentences(self) -> tuple[str, ...]:
         """Sentences about used images and images that were left out; at least one board must be usable."""
         boards = self.boards
-        count = sum(len(board.corners) for board in boards.values())
+        count = sum(len(board.corner_numbers) for board in boards.values())
         used = [one for one in self.images if one.name in boards]
         blurred = max(used, key=lambda one: one.blur)
         return (
@@ -123,7 +123,7 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
     """
     checked, predicted, corners = list[BoardImage](), {}, board.corners
     for one in images:
-        if one.is_read and one.size != (camera.width, camera.height):
+        if one.is_readable and one.size != (camera.width, camera.height):
             raise MeasurementError(
                 expected=f"an image of {camera.width} x {camera.height} px of camera '{camera.name}'",
                 value=Phrase(f"{one.size[0]} x {one.size[1]} px"),
@@ -131,9 +131,9 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
                 remedy="check the camera",
             )
         if isinstance(one.board, DetectedBoard):
-            at = corners[one.board.corners]
+            at = corners[one.board.corner_numbers]
             pose = solve_board_pose(camera, at, one.board.pixels, HampelLoss())
-            if (residual := float(np.median(pose.distance))) < MAX_MEDIAN_RESIDUAL:
+            if (residual := float(np.median(pose.residual_length))) < MAX_MEDIAN_RESIDUAL:
                 predicted[one.name] = camera.project(at @ pose.R.T + pose.t)[0]
             else:
                 reason = f"the median residual of its corners with this board and camera is {residual:.3g} px"

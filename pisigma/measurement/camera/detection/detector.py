@@ -198,8 +198,8 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
             detected = NoBoard("it is mirrored, as its markers show; do not mirror images", is_mirrored=True)
         return BoardImage(path, size, detected, np.nan)
     blur = EdgeProfiles.from_image(image, edge_pixels(detected, board), board.clearance).blur
-    if len(detected.corners) < MIN_CORNERS:
-        reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corners)}"
+    if len(detected.corner_numbers) < MIN_CORNERS:
+        reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corner_numbers)}"
     elif blur > max_blur:
         reason = f"its edges are blurred by {blur:.1f} px (standard deviation), more than {max_blur:g} px"
     else:

@@ -82,7 +82,9 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
     return dictionary
 
 
-def marker_cells(board: Board, number: int) -> Bool[np.ndarray, "cells cells"]:
+def marker_cells(board: Board, marker_number: int) -> Bool[np.ndarray, "cells cells"]:
     """Return the mask of a marker's black cells, row by row, including its black border."""
     dictionary = dictionary_of(board)
-    return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2) == 0)
+    return np.asarray(
+        cv2.aruco.generateImageMarker(dictionary, marker_number, dictionary.markerSize + 2) == 0
+    )

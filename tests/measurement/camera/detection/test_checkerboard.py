@@ -17,7 +17,7 @@ def test_corners_are_found_and_numbered_at_any_rotation_of_the_camera(roll: floa
     R, t = view(BOARD, 0.35, (roll, 0.4, -0.3))
     detected = detect_checkerboard(draw_board(BOARD, R, t), BOARD)
     assert isinstance(detected, DetectedBoard)
-    assert detected.corners.tolist() == list(range(20))
+    assert detected.corner_numbers.tolist() == list(range(20))
     true = CAMERA.project(BOARD.corners @ R.T + t)[0]
     assert_close(detected.pixels, true, atol=0.08)
     assert_close(np.sqrt(np.square(detected.pixels - true).mean()), 0.0, atol=0.03)

@@ -28,16 +28,18 @@ def test_corners_of_a_whole_board_and_of_a_piece(board, detect, largest) -> None
     image, true = draw_board(board, R, t), CAMERA.project(board.corners @ R.T + t)[0]
     whole = detect(image, board)
     assert isinstance(whole, DetectedBoard)
-    assert sorted(whole.corners.tolist()) == list(range(len(true)))
-    assert_close(whole.pixels, true[whole.corners], atol=largest)
-    assert_close(np.sqrt(np.square(whole.pixels - true[whole.corners]).mean()), 0.0, atol=largest / 2.5)
+    assert sorted(whole.corner_numbers.tolist()) == list(range(len(true)))
+    assert_close(whole.pixels, true[whole.corner_numbers], atol=largest)
+    assert_close(
+        np.sqrt(np.square(whole.pixels - true[whole.corner_numbers]).mean()), 0.0, atol=largest / 2.5
+    )
     profiles = EdgeProfiles.from_image(image, edge_pixels(whole, board), board.clearance)
     assert_close(profiles.blur, np.hypot(0.8, 0.4), rtol=0.25)
     t[0] -= 0.15  # so that a part of the board is outside
     piece, true = detect(draw_board(board, R, t), board), CAMERA.project(board.corners @ R.T + t)[0]
     assert isinstance(piece, DetectedBoard)
-    assert 4 <= len(piece.corners) < len(true)
-    assert_close(piece.pixels, true[piece.corners], atol=largest)
+    assert 4 <= len(piece.corner_numbers) < len(true)
+    assert_close(piece.pixels, true[piece.corner_numbers], atol=largest)
 
 
 @pytest.mark.parametrize(("board", "detect"), [case[:2] for case in CASES], ids=["charuco", "apriltag"])
