@@ -73,7 +73,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
             errors.position.mul_(1.1)
         held_out = HeldOutRows.from_validation(found, arm.measurements)
         text = held_out.to_csv(model.robot)
-        summary = CalibrationSummary.read(model).with_figures(held_out_rows=held_out.hashes(text))
+        summary = CalibrationSummary.read(model).with_figures(held_out_rows=held_out.compute_hashes(text))
         model = replace(model, metrics=summary.to_json())
         folder.mkdir()
         save_model(model, folder)

@@ -94,7 +94,7 @@ def test_hostile_names_are_text(hostile_page):
     data = json.loads(found.scripts[1])
     assert HOSTILE in data["frames"]
     assert "</table><b>floor" in data["frames"]
-    assert len(content.frames.names) == 2
+    assert len(content.frames.name_errors) == 2
 
 
 def test_nothing_is_loaded_from_elsewhere(hostile_page):
@@ -160,7 +160,7 @@ def test_of_very_many_rows_the_worst_are_shown(tmp_path, monkeypatch):
     monkeypatch.setattr("pisigma.validation.report.error_map.MAX_POINTS", 200)
     arm, model = geometric_under_test()
     content = report_content(model, tmp_path, measured(arm, 1_000, seed=9))
-    after = content.rows.after.position.numpy() * 1e3
+    after = content.rows.model_errors.position.numpy() * 1e3
     shown = next(layer for layer in content.map.layers if layer.key == "after").values
     assert len(shown) <= 200
     assert np.isin(np.sort(after)[-10:], shown).all()
@@ -200,4 +200,4 @@ def test_a_page_of_three_rows(tmp_path):
     arm, model = hybrid_under_test()
     content = report_content(model, tmp_path, measured(arm, 3, seed=9))
     assert "<table" in page_of(content)
-    assert torch.isfinite(content.rows.after.position).all()
+    assert torch.isfinite(content.rows.model_errors.position).all()
