@@ -1,15 +1,18 @@
 """The documentation agrees with the code: commands, snippets, links, figures, columns, recipe keys."""
 
+import ast
 import importlib.util
+import inspect
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import get_args
+from typing import Any, get_args, get_type_hints
 
 import pytest
 import yaml
@@ -169,6 +172,36 @@ def test_python_blocks_are_python(page: Path) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL)
     for block in blocks:
         compile(block, _name(page), "exec")
+
+
+def _called(call: ast.expr, names: dict[str, object]) -> Any:
+    """Return the function or class that an expression calls, or None if it is not one that `names` lead to."""
+    path = ast.unparse(call.func).split(".") if isinstance(call, ast.Call) else [""]
+    found = names.get(path[0])
+    for name in path[1:]:
+        found = getattr(found, name, None)
+    return found if callable(found) else None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_python_blocks_name_arguments_and_fields_that_exist(page: Path) -> None:
+    """Check keyword arguments of functions of pisigma, and fields of the dataclasses that these return."""
+    blocks = re.findall(r"^```python\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL)
+    nodes = [node for block in blocks for node in ast.walk(ast.parse(block))]
+    names, results = dict[str, object](), dict[str, Any]()
+    for node in nodes:
+        if isinstance(node, ast.Import | ast.ImportFrom) and "pisigma" in (text := ast.unparse(node)):
+            exec(text, names)
+    for node in nodes:
+        if called := _called(node, names) if isinstance(node, ast.Call) else None:
+            stated = {word.arg: None for word in node.keywords if word.arg}
+            inspect.signature(called).bind_partial(**stated)
+        if isinstance(node, ast.Assign) and (called := _called(node.value, names)):
+            result = called if isinstance(called, type) else get_type_hints(called).get("return")
+            results |= {ast.unparse(target): result for target in node.targets if is_dataclass(result)}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and (result := results.get(ast.unparse(node.value))):
+            assert node.attr in {*dir(result), *(one.name for one in fields(result))}, ast.unparse(node)
 
 
 def _anchors(page: Path) -> set[str]:
