@@ -65,14 +65,15 @@ class FitResiduals:
 
     Attributes:
         y: projected residuals in units of the stated noise.
-        covariance: projected covariance due to quantities known with a stated uncertainty and due to included causes.
+        covariance_without_noise: projected covariance due to quantities known with a stated uncertainty and due to
+            included causes.
         exact: projected unit vectors of the values whose noise is exactly as stated, such as that of a prior.
         is_stated: whether the noise of the other values is stated.
         causes: projected derivatives with respect to the unknowns of every cause at size 1.
     """
 
     y: Float64[Tensor, " values"]
-    covariance: Float64[Tensor, "values values"]
+    covariance_without_noise: Float64[Tensor, "values values"]
     exact: Float64[Tensor, "values _exact"]
     is_stated: bool
     causes: Mapping[str, Float64[Tensor, "values _unknowns"]] = field(repr=False)
@@ -113,7 +114,7 @@ class FitResiduals:
                 break
             named.add(best.name)
             Z = best.size * self.causes[best.name]
-            here = replace(here, covariance=here.covariance + Z @ Z.t())
+            here = replace(here, covariance_without_noise=here.covariance_without_noise + Z @ Z.t())
         causes = [replace(one, is_supported=one.name in named) for one in alone]
         return tuple(sorted(causes, key=lambda one: (not one.is_supported, -one.log_bayes_factor)))
 
@@ -142,7 +143,7 @@ class FitResiduals:
 
     def _total(self, factor: float) -> Float64[Tensor, "values values"]:
         """Return the covariance with the noise of a factor, which values with exact noise do not have."""
-        total = self.covariance + (1 - factor**2) * self.exact @ self.exact.t()
+        total = self.covariance_without_noise + (1 - factor**2) * self.exact @ self.exact.t()
         total.diagonal().add_(factor**2)
         return total
 

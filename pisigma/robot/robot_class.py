@@ -78,7 +78,8 @@ class RobotClass:
         harmonics: number of harmonics of the series.
         max_sizes: standard deviations of geometric errors that no robot of the class exceeds.
         max_changes: largest changes due to wear or a collision.
-        max_remaining_share: errors after a calibration, as a share of the reach, that no robot of the class exceeds.
+        max_calibrated_error_per_reach: largest error after a calibration of a robot of the class, as a share of its
+            reach.
         joint_repeatability: standard deviation of the values of a revolute joint from image to image [rad]; 0 if the
             pose repeatability stated for images includes it.
     """
@@ -90,7 +91,7 @@ class RobotClass:
     harmonics: int
     max_sizes: GeometricSizes
     max_changes: ChangeLimits
-    max_remaining_share: float
+    max_calibrated_error_per_reach: float
     joint_repeatability: float = 0.0
 
     @staticmethod
@@ -117,7 +118,7 @@ INDUSTRIAL: Final = RobotClass(
     harmonics=15,
     max_sizes=GeometricSizes(joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3),
     max_changes=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
-    max_remaining_share=2.5e-3,
+    max_calibrated_error_per_reach=2.5e-3,
 )
 """Arms whose joints have one eccentricity, one ovality and one gear ripple each.
 
@@ -153,7 +154,7 @@ HOBBY: Final = replace(
     prior_sizes=GeometricSizes(joint_offset=30e-3, length=1e-3, zero_length=1e-3, axis_angle=5e-3),
     max_sizes=GeometricSizes(joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3),
     max_changes=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
-    max_remaining_share=7.5e-3,
+    max_calibrated_error_per_reach=7.5e-3,
 )
 """Arms without a reliable zero: arms built by hobbyists or in a laboratory, surgical arms with potentiometers, and old
 arms that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
@@ -163,7 +164,7 @@ SERVO: Final = replace(
     name="servo",
     prior_sizes=replace(HOBBY.prior_sizes, joint_offset=0.1),
     max_sizes=replace(HOBBY.max_sizes, joint_offset=0.3),
-    max_remaining_share=0.04,
+    max_calibrated_error_per_reach=0.04,
     joint_repeatability=math.radians(0.5),
 )
 """Arms built from servos, whose zeros are set by eye in the middle of the range and are wrong by up to 17 deg
@@ -179,4 +180,4 @@ def plausible_share(robot: Robot) -> float:
 
     They are larger for arms whose joints scatter by more, such as arms of servos.
     """
-    return max(_PLAUSIBLE_SHARE, RobotClass.from_robot(robot).max_remaining_share)
+    return max(_PLAUSIBLE_SHARE, RobotClass.from_robot(robot).max_calibrated_error_per_reach)

@@ -126,7 +126,7 @@ class Tabs:
         template = self._environment.get_template("page.html.j2")
         return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=folder)
 
-    def new_cell(self, folder: Path) -> str:
+    def render_new_cell_form(self, folder: Path) -> str:
         """Render the form that creates the cell."""
         return self._environment.get_template("new.html.j2").render(
             path=folder.absolute(),

@@ -166,7 +166,7 @@ class Workbench(UploadedRows):
             if (fault := self._fault()) is not None:
                 return self._tabs.repair(self.folder, fault)
             if (cell := self._cell()) is None or (status := self.status()) is None:
-                return self._tabs.new_cell(self.folder)
+                return self._tabs.render_new_cell_form(self.folder)
             return self._tabs.tab(name, cell, status, self._texts)
 
         if name not in TABS:

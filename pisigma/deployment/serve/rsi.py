@@ -60,8 +60,8 @@ class RsiCounts:
         ignored: number of packets from other senders.
         outside_domain: number of answers outside the domain of the model, where the correction is extrapolated.
         largest_deg: largest absolute correction [deg].
-        seconds: times from packet to answer in the last cycles [s].
-        slowest: longest time from packet to answer [s].
+        answer_seconds: times from packet to answer in the last cycles [s].
+        slowest_answer: longest time from packet to answer [s].
     """
 
     answered: int = 0
@@ -69,18 +69,18 @@ class RsiCounts:
     ignored: int = 0
     outside_domain: int = 0
     largest_deg: float = 0.0
-    seconds: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_DURATIONS))
-    slowest: float = 0.0
+    answer_seconds: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_DURATIONS))
+    slowest_answer: float = 0.0
 
     @property
     def sentence(self) -> str:
         """Summary of a stream."""
-        p50, p99 = np.quantile(self.seconds or [math.nan], [0.5, 0.99]) * 1e3
+        p50, p99 = np.quantile(self.answer_seconds or [math.nan], [0.5, 0.99]) * 1e3
         return (
             f"RSI stream ended: {self.answered} cycles answered, {self.unanswered} lost or late, "
             f"{self.outside_domain} outside the domain, {self.ignored} packets of other senders; corrections at "
             f"most {self.largest_deg:.4f} deg; answers after {p50:.3f} ms (median), {p99:.3f} ms (99 %), "
-            f"{self.slowest * 1e3:.3f} ms (maximum)."
+            f"{self.slowest_answer * 1e3:.3f} ms (maximum)."
         )
 
 
@@ -287,8 +287,8 @@ class RsiServer:
                 packet, sender, began = found
                 controller = sender[0]
                 self._socket.sendto(answers.answer(packet), sender)
-                counts.seconds.append(time.perf_counter() - began)
-                counts.slowest = max(counts.slowest, counts.seconds[-1])
+                counts.answer_seconds.append(time.perf_counter() - began)
+                counts.slowest_answer = max(counts.slowest_answer, counts.answer_seconds[-1])
         finally:
             if counts.answered:
                 report(counts.sentence)

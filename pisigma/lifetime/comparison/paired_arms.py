@@ -130,7 +130,7 @@ def _check_explained(model: CalibratedModel, rms: float) -> None:
     Raises:
         MeasurementError: the positions do not fit.
     """
-    limit = RobotClass.from_robot(model.robot).max_remaining_share * model.robot.reach
+    limit = RobotClass.from_robot(model.robot).max_calibrated_error_per_reach * model.robot.reach
     if rms > limit:
         raise MeasurementError(
             "no shifts of the joint zeros explain the positions",

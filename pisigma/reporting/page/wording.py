@@ -60,12 +60,12 @@ def rows_text(accuracy: Accuracy) -> str:
 
 
 def dependence_text(dependence: Dependence) -> str:
-    """Return whether errors depend on a quantity."""
+    """Return sentences on whether errors depend on a quantity."""
     return " ".join(say("dependence", dependence, dependence.test))
 
 
 def names_text(errors: ErrorsByName) -> str:
-    """Return whether errors differ between frames or targets."""
+    """Return a sentence on whether errors differ between frames or targets."""
     return say("by_name", errors)[0]
 
 

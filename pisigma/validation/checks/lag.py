@@ -28,13 +28,13 @@ class Lag:
     Attributes:
         logged_before_arrival: whether joint values were logged before the arrival, on the way from the previous row;
             otherwise they were logged after departure.
-        motion_fraction: lag as a share of the motion between two rows [1].
+        share_of_motion: lag as a share of the motion between two rows [1].
         error_ratio: ratio of the errors with and without the lag [1].
         log_bayes_factor: logarithm of the odds of a lag against no lag.
     """
 
     logged_before_arrival: bool
-    motion_fraction: float
+    share_of_motion: float
     error_ratio: float
     log_bayes_factor: float
 
@@ -54,10 +54,10 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         kind="lag",
         severity="implausible" if lag.error_ratio > _LARGE else "warning",
         sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
-        f"{abs(lag.motion_fraction):.2g} of the motion {motion} and make the errors {lag.error_ratio:.3g} times as "
+        f"{abs(lag.share_of_motion):.2g} of the motion {motion} and make the errors {lag.error_ratio:.3g} times as "
         "large; log them when the robot has stopped.",
         cause="before_arrival" if lag.logged_before_arrival else "after_departure",
-        values={"share": lag.motion_fraction, "factor": lag.error_ratio, "log_odds": lag.log_bayes_factor},
+        values={"share": lag.share_of_motion, "factor": lag.error_ratio, "log_odds": lag.log_bayes_factor},
         remedy="Log them when the robot has stopped.",
     )
 

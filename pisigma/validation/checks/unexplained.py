@@ -40,8 +40,8 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         return
     reach = checked.robot.reach * 1e3
     usual = checked.robot_class
-    far = left > usual.max_remaining_share * reach
-    large = _LARGE if usual is not SERVO else usual.max_remaining_share
+    far = left > usual.max_calibrated_error_per_reach * reach
+    large = _LARGE if usual is not SERVO else usual.max_calibrated_error_per_reach
     if far or (left > large * reach and nominal < _HARDLY * left):
         what = "rows of the calibration" if checked.validation is None else "held-out rows"
         yield Diagnostic(
@@ -49,7 +49,7 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             severity="implausible",
             sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
             f"robots of class {usual.name} and this size have less than "
-            f"{(usual.max_remaining_share if far else large) * reach:.2g} mm after a "
+            f"{(usual.max_calibrated_error_per_reach if far else large) * reach:.2g} mm after a "
             f"calibration{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame "
             "or tool, joint values that were logged too early or rounded, and a wrong scale do not explain "
             "them; check the sensor, and what else differs between the rows.",

@@ -28,7 +28,7 @@ def test_a_lag_is_found_with_its_size(name, before):
     assert (found.kind, found.severity) == ("lag", "implausible")
     lag = find_lag(OrderedRows.from_result(check.geometric), rows)
     assert lag.logged_before_arrival == before
-    assert_close(lag.motion_fraction, SHARE, rtol=0.15)
+    assert_close(lag.share_of_motion, SHARE, rtol=0.15)
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -35,7 +35,7 @@ def test_errors_of_servos_are_plausible_for_arms_of_servos_only():
         check = checked(GeometricCalibrator(replace(arm.robot, maker=maker)), rows)
         found[maker] = [one.values["rms_mm"] / (check.robot.reach * 1e3) for one in check_unexplained(check)]
     (share,) = found.pop("Niryo")
-    assert HOBBY.max_remaining_share < share < SERVO.max_remaining_share
+    assert HOBBY.max_calibrated_error_per_reach < share < SERVO.max_calibrated_error_per_reach
     assert found == {"TheRobotStudio": []}
 
 
