@@ -145,7 +145,7 @@ def test_poses_at_ninety_degrees_of_pitch_agree_with_torch():
     model = grouped()
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
-    T[:3, :3] = torch.from_numpy(model.network.groups[0].inputs.reference) @ T[:3, :3]
+    T[:3, :3] = torch.from_numpy(model.network.groups[0].inputs.reference_rotation) @ T[:3, :3]
     T[:3, 3] = torch.tensor([0.5, 0.3, 0.4], dtype=torch.float64)
     with no_type_checker():
         expected = NumericIK(model).all_branches(T[None])

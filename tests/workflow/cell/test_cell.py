@@ -129,7 +129,7 @@ def test_rows_in_inches_are_refused_and_not_stored(year):
     with refused(AcceptanceError):
         cell.add_session(measured(12, 5, scale=1 / 25.4), day=day(1))
     assert cell.history.sessions() == before
-    assert cell.status().facts.not_taken_in == ()
+    assert cell.status().facts.unrecorded_files == ()
 
 
 def test_a_file_that_was_edited_is_named_and_not_used(year):
