@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -199,7 +199,7 @@ def plan(
     posterior = subject.posterior(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, posterior, task)
-    chosen, stored, way = problem.choose(progress)
+    chosen, stored, way, unused = problem.choose(progress)
     progress("expected accuracy")
     points = problem.curve(chosen)
     return Plan(
@@ -211,7 +211,7 @@ def plan(
         way.seconds,
         (
             *repeated,
-            *_warnings(way),
+            *_warnings(way, unused, candidates),
             *arm.unseparated_links,
             *problem.unexcited_joints,
             *problem.view_warnings(chosen),
@@ -261,11 +261,11 @@ class _Problem:
         """Whether there are earlier measurements."""
         return self.subject.model is not None or self.settings.measured is not None
 
-    def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
-        """Choose poses to calibrate with and poses to test with, and order them.
+    def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour, int]:
+        """Choose poses to calibrate with and poses to test with, and order them; also count the unused candidates.
 
-        Poses without a collision-free path are replaced, by candidates that can be reached from most others. The most
-        informative poses come first, in stages, so that the measurement may end early.
+        Poses without a collision-free path are replaced, by candidates from which most of the task can be reached. The
+        most informative poses come first, in stages, so that the measurement may end early.
         """
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
@@ -283,12 +283,12 @@ class _Problem:
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
             way = plan_tour(motions, q[poses], self.settings.pace, stages=stage_ends(len(poses)))
-            unreached = poses[way.left_out]
-            if len(unreached) and not earlier_rounds:
-                most = free[motions.reach_most(q[free])]
+            free = _without(free, poses[way.left_out])
+            if len(way.left_out) and not earlier_rounds:
+                most = free[motions.reach_most(q[free], self.task)]
                 free = most if len(most) >= len(poses) else free
-            free, kept, kept_check = (_without(some, unreached) for some in (free, chosen, check))
-            if not len(unreached) or len(free) < len(poses):
+            kept, kept_check = (some[torch.isin(some, free)] for some in (chosen, check))
+            if not len(way.left_out) or len(free) < len(poses):
                 break
         ordered = poses[way.order]
         is_check, number = use[way.order] >= count, self.candidates.number[ordered]
@@ -297,6 +297,7 @@ class _Problem:
             kept,
             StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.waypoints_before),
             way,
+            len(q) - len(free),
         )
 
     def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
@@ -367,9 +368,15 @@ def _without(indices: Int64[Tensor, " all"], removed: Int64[Tensor, " removed"])
     return indices[~torch.isin(indices, removed)]
 
 
-def _warnings(way: Tour) -> tuple[str, ...]:
-    """Return a warning about poses without a collision-free path; empty if there are none."""
-    if not len(way.left_out):
-        return ()
-    left_out = f"{len(way.left_out)} poses were left out, because there is no collision-free path to them"
-    return (f"{left_out}; give more candidates.",)
+def _warnings(way: Tour, unused: int, candidates: Candidates) -> Iterator[str]:
+    """Return warnings about poses and candidates without a collision-free path."""
+    if unused:
+        yield (
+            f"{unused:,} of {len(candidates.q):,} candidates were not used, because no collision-free path between "
+            "them and the planned poses was found; the motion to the first pose must not start there."
+        )
+    if len(way.left_out):
+        yield (
+            f"{len(way.left_out)} poses were left out, because there is no collision-free path to them; give more "
+            "candidates."
+        )

@@ -91,14 +91,16 @@ def test_an_unreachable_pose_is_left_out():
     assert len(way.order) == 2
 
 
-def test_poses_in_the_smaller_part_of_the_free_space_are_found():
+def test_the_part_of_the_free_space_with_the_task_is_found():
     arm = scara_between_walls(200)
     q = draw_candidates(arm, 300, 0).q
     front = q[:, 0] > 0
     few_behind = torch.cat([q[front], q[~front][:20]])
-    reached = Motions(arm, few_behind).reach_most(q)
-    assert not bool(reached[~front].any())
-    assert float(reached[front].double().mean()) > 0.95
+    motions = Motions(arm, few_behind)
+    for part in (front, ~front):
+        reached = motions.reach_most(q, q[part])
+        assert not bool(reached[~part].any())
+        assert float(reached[part].double().mean()) > 0.95
 
 
 def test_paths_with_several_waypoints_are_collision_free():

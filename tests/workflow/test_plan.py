@@ -15,8 +15,10 @@ from testing.report import hybrid_under_test
 
 from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.measurement.dataset import Measurements
+from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import is_free
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -178,17 +180,26 @@ def test_plans_are_the_same_at_every_call():
     assert one.accuracy_curve == other.accuracy_curve
 
 
-def test_all_poses_are_planned_if_the_free_space_has_two_parts():
+@pytest.mark.parametrize("task_in_front", [None, True, False])
+def test_all_poses_are_planned_in_the_part_of_the_free_space_that_contains_the_task(
+    tmp_path: Path, task_in_front: bool | None
+):
     boxes = [
         {"name": f"wall {side}", "center_mm": (side * 3200, 0, 1500), "size_mm": (6000, 40, 3000)}
         for side in (-1, 1)
     ]
-    planned = plan(
-        "kiro3",
-        PlanSettings(count=12, check=4, candidates=300, limit_mm=2.0),
-        CELL.model_validate({"boxes": boxes}),
-    )
+    settings = PlanSettings(count=12, check=4, candidates=300, limit_mm=2.0)
+    if task_in_front is not None:
+        q = draw_candidates(ArmInSurroundings.from_robot(Robot.load("kiro3")), 60, 1).q
+        q = q[(q[:, 0] > 0) == task_in_front]
+        Measurements(q=q, position=torch.zeros(len(q), 3, dtype=torch.float64)).write_csv(
+            tmp_path / "task.csv", Robot.load("kiro3")
+        )
+        settings = replace(settings, task=tmp_path / "task.csv")
+    planned = plan("kiro3", settings, CELL.model_validate({"boxes": boxes}))
     q = planned.stored_plan.q
     assert len(q) == 16
     assert int(planned.stored_plan.check.sum()) == 4
     assert len(q[:, 0].sign().unique()) == 1
+    assert task_in_front is None or bool((q[0, 0] > 0) == task_in_front)
+    assert len(planned.warnings) >= 1

@@ -94,15 +94,27 @@ class Motions:
         lengths[first, second] = lengths[second, first] = _lengths(self.arm, nodes[first], nodes[second])
         return nodes, lengths
 
-    def reach_most(self, poses: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
-        """Return the mask of poses with a free motion to the largest connected part of the roadmap.
+    def reach_most(
+        self, poses: Float64[Tensor, "poses dof"], task: Float64[Tensor, "tasks dof"]
+    ) -> Bool[Tensor, " poses"]:
+        """Return the mask of poses with a free motion to the connected part of the roadmap that most of a task reaches.
 
         Free poses can form parts without motions between them, such as those on both sides of a collision of the
         gripper with the forearm.
+
+        Args:
+            poses: joint values [rad or m].
+            task: joint values at which the robot must be accurate [rad or m].
         """
         nodes, lengths = self._roadmap
-        part = connected_components(np.isfinite(lengths), directed=False)[1]
-        nodes = nodes[part == np.bincount(part).argmax()]
+        number = connected_components(np.isfinite(lengths), directed=False)[1]
+        parts = [nodes[number == part] for part in np.unique(number)]
+        return self._reach(poses, max(parts, key=lambda part: int(self._reach(task, part).sum())))
+
+    def _reach(
+        self, poses: Float64[Tensor, "poses dof"], nodes: Float64[Tensor, "nodes dof"]
+    ) -> Bool[Tensor, " poses"]:
+        """Return the mask of poses with a free motion to one of the nearest nodes."""
         nearest = torch.stack([_travel(self.arm, poses, node) for node in nodes], 1).argsort(1)
         reached = torch.zeros(len(poses), dtype=torch.bool)
         for node in nearest.unbind(1)[:_NEAREST]:
