@@ -35,7 +35,7 @@ class ExpectedAccuracy:
         poses: number of measured poses.
         rms: root mean square [m].
         p95: 95 % quantile [m].
-        random_rms: root mean square after the same number of random candidates [m].
+        random_rms: root mean square after the same number of random usable candidates [m].
     """
 
     poses: int
@@ -66,6 +66,7 @@ def accuracy_curve(
     chosen: Int64[Tensor, " chosen"],
     counts: Sequence[int],
     seed: int = 0,
+    usable: Int64[Tensor, " usable"] | None = None,
 ) -> tuple[ExpectedAccuracy, ...]:
     """Predict the accuracy as a function of the number of poses.
 
@@ -76,11 +77,11 @@ def accuracy_curve(
         chosen: indices of the selected candidates, in their order.
         counts: numbers of poses.
         seed: random seed of the random selections.
+        usable: indices of the candidates from which random poses are selected; None for all.
     """
     generator = torch.Generator().manual_seed(seed)
-    orders = [
-        torch.randperm(len(candidate_derivatives), generator=generator) for _ in range(_RANDOM_SELECTIONS)
-    ]
+    usable = torch.arange(len(candidate_derivatives)) if usable is None else usable
+    orders = [usable[torch.randperm(len(usable), generator=generator)] for _ in range(_RANDOM_SELECTIONS)]
     points = []
     for count in counts:
         after = multiply_updated_root(task_derivatives, candidate_derivatives[chosen[:count]].flatten(0, 1))

@@ -199,9 +199,9 @@ def plan(
     posterior = subject.posterior(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, posterior, task)
-    chosen, stored, way, unused = problem.choose(progress)
+    chosen, stored, way, usable = problem.choose(progress)
     progress("expected accuracy")
-    points = problem.curve(chosen)
+    points = problem.curve(chosen, usable)
     return Plan(
         stored,
         candidates,
@@ -211,7 +211,7 @@ def plan(
         way.seconds,
         (
             *repeated,
-            *_warnings(way, unused, candidates),
+            *_warnings(way, len(candidates.q) - len(usable), candidates),
             *arm.unseparated_links,
             *problem.unexcited_joints,
             *problem.view_warnings(chosen),
@@ -261,8 +261,10 @@ class _Problem:
         """Whether there are earlier measurements."""
         return self.subject.model is not None or self.settings.measured is not None
 
-    def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour, int]:
-        """Choose poses to calibrate with and poses to test with, and order them; also count the unused candidates.
+    def choose(
+        self, progress: Progress
+    ) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour, Int64[Tensor, " usable"]]:
+        """Choose poses to calibrate with and poses to test with, order them, and return the usable candidates.
 
         Poses without a collision-free path are replaced, by candidates from which most of the task can be reached. The
         most informative poses come first, in stages, so that the measurement may end early.
@@ -297,13 +299,15 @@ class _Problem:
             kept,
             StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.waypoints_before),
             way,
-            len(q) - len(free),
+            free,
         )
 
-    def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
+    def curve(
+        self, chosen: Int64[Tensor, " chosen"], usable: Int64[Tensor, " usable"]
+    ) -> tuple[ExpectedAccuracy, ...]:
         """Return the expected accuracy by the number of poses, from 0 poses if there are earlier measurements."""
         first, count = 0 if self.has_measurements else _STEP, len(chosen)
-        return self._curve(chosen, [*range(first, count, _STEP), count])
+        return self._curve(chosen, [*range(first, count, _STEP), count], usable)
 
     def poses_needed(
         self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]
@@ -360,8 +364,13 @@ class _Problem:
         found = view_warnings(self.views.incidence_angles(self.arm, q), q, self.arm.robot)
         return tuple(one.sentence for one in found)
 
-    def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
-        return accuracy_curve(self.measured, self.tool, chosen, counts, self.settings.seed)
+    def _curve(
+        self,
+        chosen: Int64[Tensor, " chosen"],
+        counts: list[int],
+        usable: Int64[Tensor, " usable"] | None = None,
+    ) -> tuple[ExpectedAccuracy, ...]:
+        return accuracy_curve(self.measured, self.tool, chosen, counts, self.settings.seed, usable)
 
 
 def _without(indices: Int64[Tensor, " all"], removed: Int64[Tensor, " removed"]) -> Int64[Tensor, " rest"]:
