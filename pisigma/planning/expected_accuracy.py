@@ -71,9 +71,9 @@ def accuracy_curve(
     """Predict the accuracy as a function of the number of poses.
 
     Args:
-        candidate_derivatives: derivatives of the measured values of the candidates under the prior; see
+        candidate_derivatives: derivatives B of the measured values of the candidates under the prior; see
             `RobotPosterior.sensitivities`.
-        task_derivatives: derivatives of the tool's position over the task; see `RobotPosterior.tool_derivatives`.
+        task_derivatives: derivatives D of the tool's position over the task; see `RobotPosterior.tool_derivatives`.
         chosen: indices of the selected candidates, in their order.
         counts: numbers of poses.
         seed: random seed of the random selections.
@@ -140,11 +140,8 @@ def remaining_errors(
     group exactly would remove the projection of D on the directions of R_g (conditioning of a normal distribution).
     """
     known = posterior.uncertainty
-    D, root, total = (
-        posterior.tool_derivatives(task),
-        known.dense_root,
-        rms_of(posterior.tool_derivatives(task)) ** 2,
-    )
+    D, root = posterior.tool_derivatives(task), known.dense_root
+    total = rms_of(D) ** 2
     errors = []
     for name, rows in _groups(posterior).items():
         # directions in which the group hardly varies are rounding errors

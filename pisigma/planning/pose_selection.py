@@ -44,9 +44,9 @@ def select_poses(
     and Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 select poses by observability.
 
     Args:
-        candidate_derivatives: derivatives of the measured values of the candidates under the prior; see
+        candidate_derivatives: derivatives B of the measured values of the candidates under the prior; see
             `RobotPosterior.sensitivities`.
-        task_derivatives: derivatives of the tool's position over the task under the prior; see
+        task_derivatives: derivatives D of the tool's position over the task under the prior; see
             `RobotPosterior.tool_derivatives`.
         count: number of poses to select.
         criterion: "D" or "I", see the description above.
@@ -269,8 +269,8 @@ def complete_selection(
     """Add the most useful of the other candidates to a selection, and sort all of them; see `select_poses`.
 
     Args:
-        candidate_derivatives: derivatives of the measured values of the candidates under the prior.
-        task_derivatives: derivatives of the tool's position over the task under the prior.
+        candidate_derivatives: derivatives B of the measured values of the candidates under the prior.
+        task_derivatives: derivatives D of the tool's position over the task under the prior.
         kept: indices of the candidates that are already selected.
         others: indices of the candidates to choose from.
         count: number of poses to select, including those already selected.
@@ -282,8 +282,8 @@ def complete_selection(
     if not len(kept):
         return others[select_poses(candidate_derivatives[others], task_derivatives, count, criterion)]
     if added := count - len(kept):
-        # the value of a candidate is what it adds to the poses already selected, so B and D are taken under their
-        # posterior
+        # the value of a candidate is what it adds to the poses already selected, so the derivatives are taken
+        # under their posterior
         measured = candidate_derivatives[kept].flatten(0, 1)
         after, task = (
             multiply_updated_root(candidate_derivatives[others], measured),

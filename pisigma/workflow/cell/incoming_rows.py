@@ -117,7 +117,7 @@ class IncomingRows:
         return self.files[0] if self.imported_rows is None else self.imported_rows.measurements
 
     def check(self, day: str = "") -> tuple[Diagnostic, ...]:
-        """Check the rows as `Sessions.add` does, and return the findings.
+        """Check the rows as `Sessions.add_session` does, and return the findings.
 
         Raises:
             MeasurementError: see `Sessions.add_session`.
