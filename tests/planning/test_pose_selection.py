@@ -124,7 +124,10 @@ def test_a_completed_selection_keeps_poses_and_leaves_little_more_error(posterio
 def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) -> None:
     q, task = random_joints(80, 4), random_joints(40, 5)
     chosen = select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), 20)
-    points = accuracy_curve(posterior.sensitivities(q), posterior.tool_derivatives(task), chosen, (10, 20))
+    B, D = posterior.sensitivities(q), posterior.tool_derivatives(task)
+    points = accuracy_curve(B, D, chosen, (10, 20))
+    (same,) = accuracy_curve(B, D, chosen, (20,), usable=chosen)
+    assert_close(same.random_rms, same.rms, rtol=1e-9)
     for point in points:
         after = posterior.after_measuring(q[chosen[: point.poses]])
         assert_close(point.rms, float(after.sigma(task).square().mean().sqrt()), rtol=1e-6)
