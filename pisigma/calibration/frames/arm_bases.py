@@ -26,6 +26,7 @@ from pisigma.calibration.frames.shared_objects import (
     JOINT,
     TOUCH,
     ArmPosterior,
+    Postures,
     SharedObject,
     find_shared_objects,
 )
@@ -40,8 +41,9 @@ from pisigma.calibration.frames.touch_equations import (
 )
 from pisigma.estimation.covariance_root import ConditionedUnknowns, condition_on_equalities
 from pisigma.files.errors import IdentificationError, Phrase
+from pisigma.measurement.conditions import JointState
 from pisigma.robot.frame_fits import moved_frame
-from pisigma.robot.se3 import invert, pose_error
+from pisigma.robot.se3 import invert, pose_error, skew
 
 _CLOSURE = 1e-9
 """Standard deviation [m or rad] with which frames and points that two arms share are equated, for rounding errors."""
@@ -124,6 +126,38 @@ class ArmBases:
         )
         turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
         return T, turned @ turned.mT
+
+    def tool_to_tool_deviation(self, first: int, second: int, postures: tuple[Postures, ...]) -> float:
+        """Return the RMS standard deviation of the vector from the tool of one arm to that of another [m].
+
+        Unlike the uncertainty of the bases, it does not depend on errors that a base absorbs, such as the zero of
+        joint 1.
+
+        Args:
+            first: number of an arm.
+            second: number of the other arm.
+            postures: postures of every arm; the n-th postures of both arms form a pair, in which the shared joints of
+                a torso have the values of the first arm.
+        """
+        count = min(len(postures[number].q_corrected) for number in (first, second))
+        one, other = (postures[number][torch.arange(count)] for number in (first, second))
+        shared = self.joints_in_common(first, second)
+        q, moved = other.state.q.clone(), other.q_corrected.clone()
+        q[:, :shared], moved[:, :shared] = one.state.q[:, :shared], one.q_corrected[:, :shared]
+        other = Postures(JointState(q, other.state.conditions), moved)
+        apart = self._tool_root(second, other) - self._tool_root(first, one)
+        return float(apart.square().sum((1, 2)).mean().sqrt())
+
+    def _tool_root(self, number: int, postures: Postures) -> Float64[Tensor, "postures 3 directions"]:
+        """Return a root of the covariance of the positions of a tool in the base of the first arm."""
+        arm = self.arms[number]
+        sizes = [one.covariance_root.shape[1] for one in self.arms]
+        T, columns = arm.positions_in_base(postures)
+        in_base = columns @ (arm.covariance_root @ torch.split(self.conditioned.z_root, sizes)[number])
+        R = self.T_first_base[number, :3, :3]
+        away = (R @ T[:, :3, 3, None])[..., 0]
+        shift, turn = self.covariance_root[number, :3], self.covariance_root[number, 3:]
+        return R @ in_base + shift - skew(away) @ turn
 
     def joints_in_common(self, first: int, second: int) -> int:
         """Return the number of joints of a torso that two arms share."""

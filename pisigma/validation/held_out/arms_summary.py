@@ -8,7 +8,6 @@ import torch
 
 from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
 from pisigma.calibration.frames.shared_objects import TOUCH, Postures
-from pisigma.calibration.frames.tool_to_tool import tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.yaml_file import Section
 from pisigma.robot.se3 import xyzrpy_from_transform
@@ -147,7 +146,7 @@ def base_figures(
         in_base_of=bases.arms[first_arm].name,
         standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
         covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
-        tool_to_tool_mm=tool_to_tool_deviation(bases, first_arm, second_arm, postures) * 1e3,
+        tool_to_tool_mm=bases.tool_to_tool_deviation(first_arm, second_arm, postures) * 1e3,
         **values,
     )
 

@@ -27,7 +27,6 @@ from testing.two_arms import (
 
 from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.shared_objects import ArmPosterior, Postures
-from pisigma.calibration.frames.tool_to_tool import tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError
@@ -181,7 +180,7 @@ def test_vector_between_the_tools_is_known_as_stated():
         ]
         between = np.array(tools[2]) - tools[0] - (np.array(tools[3]) - tools[1])
         errors.append(np.square(between).sum(1).mean())
-        stated.append(tool_to_tool_deviation(found, 0, 1, postures) ** 2)
+        stated.append(found.tool_to_tool_deviation(0, 1, postures) ** 2)
     assert_close(np.sqrt(np.mean(errors) / np.mean(stated)), 1.0, atol=0.25)
 
 
