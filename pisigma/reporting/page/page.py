@@ -112,6 +112,8 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
             for layer in error_map.layers
         ],
         "row": _packed(error_map.row),
+        "numberings": list(dict.fromkeys(error_map.numbering)),
+        "numbering": _packed(numbers_of_names(error_map.numbering)),
         "q": _packed(error_map.q),
         "joints": [
             {"name": joint.name, "unit": "°" if turns else "mm"}

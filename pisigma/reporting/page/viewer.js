@@ -9,6 +9,7 @@
     return values;
   };
   const place = unpack(data.place), q = unpack(data.q), row = unpack(data.row), inside = unpack(data.inside);
+  const numbering = unpack(data.numbering), rowText = (i) => `${data.numberings[numbering[i]]} ${row[i]}`;
   const frame = unpack(data.frame), target = unpack(data.target);
   const count = row.length, dof = data.joints.length;
   const layers = data.layers.map((layer) => ({ ...layer, values: unpack(layer.values) }));
@@ -210,7 +211,7 @@
       const line = document.createElement("tr");
       line.append(text("th", name), text("td", value)); table.append(line);
     }
-    panel.replaceChildren(text("strong", row[i] > 0 ? `row (line) ${row[i]}` : "sample"), table);
+    panel.replaceChildren(text("strong", row[i] > 0 ? rowText(i) : "sample"), table);
   };
   const nearest = (x, y, reach) => {
     let best = -1, least = reach * reach, front = Infinity;
@@ -304,7 +305,7 @@
     const names = ["row", "frame", "target", ...data.joints.map((joint) => `${joint.name} [${joint.unit}]`), "x [mm]", "y [mm]", "z [mm]", ...layers.map((layer) => `${layer.label} [${layer.unit}]`)];
     const number = (v) => (Number.isFinite(v) ? String(Number(v.toPrecision(6))) : "");
     const rows = Array.from(row, (one, i) => [
-      number(one), data.frames[frame[i]] ?? "", data.targets[target[i]] ?? "", ...data.joints.map((_, j) => number(q[dof * i + j])),
+      one > 0 ? rowText(i) : "", data.frames[frame[i]] ?? "", data.targets[target[i]] ?? "", ...data.joints.map((_, j) => number(q[dof * i + j])),
       ...[0, 1, 2].map((a) => number(place[3 * i + a])), ...layers.map((layer) => number(layer.values[i])),
     ]);
     return [names, ...rows];

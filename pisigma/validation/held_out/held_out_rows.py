@@ -37,6 +37,8 @@ class HeldOutRows:
         residual: measured minus predicted position under the last model [m], in the row's frame; NaN in rows that were
             never held out, and if it is not stored.
         data_sha256: hash of the measurements.
+        line: line of every row in its file; 0 for rows that were not read from a file, or if it is not stored.
+        origin: name of the file of every row if they come from several files; otherwise empty.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -45,6 +47,8 @@ class HeldOutRows:
     models: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
     data_sha256: str
+    line: tuple[int, ...] = ()
+    origin: tuple[str, ...] = ()
 
     @staticmethod
     def from_validation(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
@@ -63,6 +67,8 @@ class HeldOutRows:
             validation.models,
             residual.double(),
             measurements.content_hash(),
+            measurements.line,
+            tuple(Path(name).name for name in measurements.origin),
         )
 
     def to_csv(self, robot: Robot) -> str:
@@ -76,6 +82,8 @@ class HeldOutRows:
             factor, unit = (_DEGREES, "deg") if revolute else (1e3, "mm")
             columns[f"q{j + 1}_{unit}"] = [f"{value:.10g}" for value in (self.q[:, j] * factor).tolist()]
         columns |= {"frame": list(self.frame), "target": list(self.target)}
+        columns |= {"file": list(self.origin)} if self.origin else {}
+        columns |= {"line": list(map(str, self.line))} if any(self.line) else {}
         for name, errors in self.models.items():
             columns[f"{name}_mm"] = _cells(errors.position * 1e3)
             if errors.rotation is not None:
@@ -127,7 +135,8 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     kept = [_numbers(columns[name]) / 1e3 for name in _RESIDUAL if name in columns]
     residual = torch.stack(kept, 1) if kept else none
     frame, target = columns["frame"], columns["target"]
-    return HeldOutRows(torch.stack(q, 1), frame, target, models, residual, hashes.data_sha256)
+    line, origin = tuple(map(int, columns.get("line", ()))), columns.get("file", ())
+    return HeldOutRows(torch.stack(q, 1), frame, target, models, residual, hashes.data_sha256, line, origin)
 
 
 def _cells(values: Float64[Tensor, " rows"]) -> list[str]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -145,7 +146,12 @@ def rows_of_file(
 def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
     """Return the held-out rows that a model folder stores, as `JudgedRows`."""
     rows = Measurements(
-        q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
+        q=held_out.q,
+        frame=held_out.frame,
+        target=held_out.target,
+        line=held_out.line,
+        source=model.provenance.data_source,
+        origin=held_out.origin,
     )
     origins = ("held_out", "held_out")
     judged = _judged(model, rows, held_out.models, held_out.residual, origins)
@@ -186,7 +192,9 @@ def _judged(
 ) -> JudgedRows:
     return JudgedRows(
         row_origin=origins[0],
-        measurements=replace(rows, source=rows.file_names),
+        measurements=replace(
+            rows, source=rows.file_names, origin=tuple(Path(name).name for name in rows.origin)
+        ),
         position=tool_positions(model, rows.q),
         models=models,
         residual=residual,

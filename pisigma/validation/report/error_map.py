@@ -61,6 +61,7 @@ class ErrorMap:
         position: position of the tool in the robot's base frame [mm].
         layers: quantities that can be shown, at least one.
         row: line of every point's row in the file, or else the number of the row from 1; 0 for samples.
+        numbering: what `row` counts at every point: "line", "b.csv, line" if the rows are of several files, or "row".
         q: joint values [deg or mm].
         frame: frame of every point.
         target: target of every point.
@@ -74,6 +75,7 @@ class ErrorMap:
     position: Float64[np.ndarray, "points 3"]
     layers: tuple[Layer, ...]
     row: Int64[np.ndarray, " points"]
+    numbering: tuple[str, ...]
     q: Float64[np.ndarray, "points dof"]
     frame: tuple[str, ...]
     target: tuple[str, ...]
@@ -161,6 +163,10 @@ def _map(
         tool_positions(model, points.q).numpy() * 1e3,
         tuple(layers),
         number.numpy(),
+        tuple(
+            f"{name}, line" if line and name else "line" if line else "row"
+            for line, name in zip(points.line, points.origin or ("",) * points.rows, strict=True)
+        ),
         points.q.numpy() * factor,
         points.frame,
         points.target,

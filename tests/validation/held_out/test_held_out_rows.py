@@ -15,10 +15,13 @@ from testing.report import bare_summary
 from pisigma.files.errors import ModelError
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.faults import RowPlace
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation
 from pisigma.validation.held_out.held_out_rows import HeldOutRows, read_held_out
+from pisigma.validation.held_out.judged_rows import rows_of_folder
 from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread
+from pisigma.validation.report.error_map import largest_errors, map_of_rows
 
 ROWS = 20
 
@@ -76,6 +79,22 @@ def test_rows_come_back(measured, tmp_path, turned, spread):
         assert_close(found.residual, validation.spread.error, rtol=6e-5)
     else:
         assert bool(torch.isnan(found.residual).all())
+
+
+def test_rows_of_a_report_are_named_by_file_and_line(measured, tmp_path):
+    line, origin = tuple(range(3, 3 + 2 * ROWS, 2)), ("/a/first.csv", "/a/second.csv") * (ROWS // 2)
+    text, model = _kept(
+        hand_made_model("kiro3"),
+        _validation(ROWS, False, False),
+        replace(measured, line=line, origin=origin),
+    )
+    (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
+    rows = rows_of_folder(model, read_held_out(tmp_path, model))
+    shown = map_of_rows(model, rows)
+    assert shown.row.tolist() == list(line)
+    assert shown.numbering == ("first.csv, line", "second.csv, line") * (ROWS // 2)
+    worst = largest_errors(rows).row
+    assert rows.measurements.place_of(worst) == RowPlace(origin[worst][3:], line[worst])
 
 
 def test_columns_bear_their_units(measured):
