@@ -8,7 +8,7 @@ MODULE PisigmaClient
         SocketConnect pisigma, host, port;
     ENDPROC
 
-    ! Joint values for a pose of the tool in the base frame. FALSE if there are none: do not move then.
+    ! Joint values for a pose of the tool in the frame of the measurements. FALSE if there are none: do not move then.
     FUNC bool PisigmaJoints(pose requested, num number, INOUT robjoint target)
         VAR num q{6};
         VAR bool reached;

@@ -173,7 +173,8 @@ def compare(
         second: the model to compare with, given in the same way.
         rows: measurements, or their file, on which both models are compared. If rows are marked, only those of the set
             "test" are used.
-        program: file of joint values, or of poses in the base frame, that was taught with the first model.
+        program: file of joint values, or of poses in the frame of the measurements, that was taught with the first
+            model.
         settings: see `ComparisonSettings`.
 
     Raises:

@@ -91,7 +91,7 @@ def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
     """Return a stated pose T_base_tool as a batch `(1, 4, 4)` [m].
 
     Args:
-        values: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the base frame.
+        values: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the frame of the measurements.
 
     Raises:
         PoseError: a value is not valid for a pose.

@@ -31,7 +31,7 @@ _SAME_BRANCH = 0.05
 another branch."""
 
 Box = tuple[float, float, float, float, float, float]
-"""x_min, x_max, y_min, y_max, z_min, z_max [m] in the base frame."""
+"""x_min, x_max, y_min, y_max, z_min, z_max [m] in the frame of the measurements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +185,6 @@ def _too_few(
     return IdentificationError(
         f"robot '{ik.model.robot.name}' reaches only {have} of {drawn} random poses {where} ({reasons})",
         value={name: number for name, number in refused.items() if number},
-        remedy="choose a region that it reaches, in the base frame of the model, with the orientations of the measured "
-        "poses",
+        remedy="choose a region that it reaches, in the frame of the measurements, with the orientations of the "
+        "measured poses",
     )

@@ -37,7 +37,8 @@ ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of an arm with
 def ik(
     model: ModelOrCell,
     pose: Annotated[
-        Pose | None, typer.Option(help="X Y Z ROLL PITCH YAW of the tool in the base frame [mm, deg].")
+        Pose | None,
+        typer.Option(help="X Y Z ROLL PITCH YAW of the tool in the frame of the measurements [mm, deg]."),
     ] = None,
     poses: Annotated[
         Path | None,
@@ -54,7 +55,8 @@ def ik(
         bool,
         typer.Option(
             "--accuracy",
-            help="With --poses, also predict the standard deviation of the tool's position; slow for hybrid models.",
+            help="With --poses, also predict the standard deviation of the tool's position, sqrt(sx^2 + sy^2 + sz^2); "
+            "slow for hybrid models.",
         ),
     ] = False,
     path: Annotated[

@@ -29,8 +29,8 @@ Out = Annotated[Path | None, typer.Option(help="Model folder to write. [default:
 RegionMm = Annotated[
     Box | None,
     typer.Option(
-        help="Region of the tool in the base frame, X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX [mm]. [default: region of "
-        "the measurements of the model]"
+        help="Region of the tool in the frame of the measurements, X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX [mm]. [default: "
+        "region of the measurements of the model]"
     ),
 ]
 Joints = Annotated[

@@ -65,7 +65,8 @@ def sentences(targets: Targets) -> tuple[str, ...]:
         "x to yaw: pose of the nominal robot at q, FK_nominal(q), to command to a controller that computes with the "
         "nominal robot, this base and this tool. Rotation = RotZ(roll) RotY(pitch) RotX(yaw).",
         f"Nominal robot: {targets.robot.name}; base: {frames['base']}; tool: {frames['tool']}.",
-        "sigma: predicted standard deviation of the reached position; empty if it is not known.",
+        "sigma: predicted standard deviation of the reached position, sqrt(sx^2 + sy^2 + sz^2) of its coordinates; "
+        "empty if it is not known.",
         *targets.remarks,
     )
 

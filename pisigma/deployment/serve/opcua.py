@@ -211,7 +211,10 @@ class _Robot:
         )
         inputs = [
             _argument(
-                "Pose", ua.ObjectIds.Double, "x, y, z [mm], roll, pitch, yaw [deg] of the tool in the base", 6
+                "Pose",
+                ua.ObjectIds.Double,
+                "x, y, z [mm], roll, pitch, yaw [deg] of the tool in the frame of the measurements",
+                6,
             ),
             _argument(
                 "Near", ua.ObjectIds.Double, "joint values to stay close to [deg or mm]; NaN for none", dof

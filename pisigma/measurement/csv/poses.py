@@ -241,7 +241,7 @@ def _columns(header: Sequence[str], place: Place) -> dict[str, tuple[int, Column
                 expected="a column of a pose",
                 value=name,
                 at=replace(place, column=name),
-                remedy=f"{nearest_choice(name, valid)} Lengths may also be in m, and angles in rad.",
+                remedy=f"{nearest_choice(name, valid)} Lengths may also be in m.",
             )
         if column.quantity in columns:
             raise MeasurementError(

@@ -104,7 +104,7 @@ class CompiledIK:
         """Find corrected joint values for one pose.
 
         Args:
-            T_base_tool: `(4, 4)`: target pose of the tool in the base frame [m].
+            T_base_tool: `(4, 4)`: target pose of the tool in the frame of the measurements [m].
             near: `(dof,)` joint values [rad or m], for example the robot's current joint values. Among the branches
                 that reach the pose, the nearest is chosen, with revolute joints wrapped as near as their limits allow.
             branch: name of the branch to use. Without `near` and `branch`, branches are tried in order of decreasing

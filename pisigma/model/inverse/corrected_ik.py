@@ -136,7 +136,7 @@ class CorrectedIK(AbstractInverse):
         """Find corrected joint values for poses.
 
         Args:
-            T_base_tool: `(*batch, 4, 4)` target poses of the tool in the base frame [m].
+            T_base_tool: `(*batch, 4, 4)` target poses of the tool in the frame of the measurements [m].
             near: joint values `(*batch, dof)` or `(dof,)` [rad or m], for example the robot's current joint values.
                 Among the branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to
                 `near` as their limits allow. Distances add radians and metres with equal weight.

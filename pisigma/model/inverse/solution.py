@@ -73,7 +73,7 @@ class AbstractInverse(ABC):
 
     @abstractmethod
     def accuracy(self, q: Any, *, approach: Any = None) -> Any:
-        """Predict the standard deviation of the tool's position [m]."""
+        """Predict the standard deviation of the tool's position [m], `sqrt(σx² + σy² + σz²)`."""
 
     @abstractmethod
     def with_axes(self, axes: TaskAxes) -> "AbstractInverse":
@@ -136,7 +136,7 @@ class Solution:
 
     @cached_property
     def accuracy(self) -> Any:
-        """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN if the model has no uncertainty.
+        """Predicted standard deviation `sqrt(σx² + σy² + σz²)` of the position [m], `(*batch,)`; NaN if unknown.
 
         It is computed with torch in float64 on first access.
         """

@@ -32,7 +32,7 @@ class RegionFigures(Section):
     Attributes:
         kind: "joints" for interpolated rows of joint values, or "box" for tool positions in a box.
         rows: number of these rows of joint values.
-        box_mm: x_min, x_max, y_min, y_max, z_min, z_max of the tool in the base frame [mm].
+        box_mm: x_min, x_max, y_min, y_max, z_min, z_max of the tool in the frame of the measurements [mm].
         joints: ranges of the joint values.
     """
 

@@ -56,7 +56,7 @@ def solution(stamped, near, arm, solve):
     """Request the joint values of a geometry_msgs/PoseStamped.
 
     Args:
-        stamped: desired pose of the tool in the base frame.
+        stamped: desired pose of the tool in `arm.base_frame`.
         near: joint values to stay close to, in the order of the model; None for none.
         arm: The arm.
         solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
