@@ -143,6 +143,9 @@ def fits_of(
         if prediction is None:
             yield {**base, **fit}, None
             continue
+        if split == "session" and not np.isfinite(prediction.T).all():
+            yield {**base, "status": "predicts no rotations, to which base and tool could be fitted"}, None
+            continue
         numbers = np.arange(len(test.q)) if split == "session" else fold.test
         errors = row_errors(test_series, prediction, test, numbers, split == "session")
         distance = errors_between_sockets(prediction, test, test_series.known_distances(test))

@@ -111,6 +111,21 @@ def test_larger_fits_are_not_tried_after_an_overrun(module, shared_data, monkeyp
     assert [fit["status"] for fit, _ in sockets] == ["does not use rows of the kind 'socket'"]
 
 
+def test_positions_alone_are_not_compared_with_another_session(module, shared_data, monkeypatch):
+    """Base and tool, which have moved, could not be fitted to them."""
+    fits, series = module("fits"), module("series").series_of("ur10_c")
+
+    def positions(task, method, python):
+        T = np.tile(np.eye(4), (len(task.test.q), 1, 1))
+        T[:, :3, :3] = np.nan
+        return {"status": "done"}, module("rows").Prediction(T)
+
+    monkeypatch.setattr(fits, "predict", positions)
+    ((fit, errors),) = fits.fits_of(series, "session", module("methods").method_of("nominal"), sys.executable)
+    assert errors is None
+    assert fit["status"].startswith("predicts no rotations")
+
+
 def make_errors(scores: ModuleType, scale: float) -> object:
     error = scale * np.random.default_rng(1).standard_normal((400, 3))
     return scores.RowErrors(
