@@ -170,10 +170,14 @@ def draw_map(
             order = np.concatenate([order[:-_MAX_MAP_DOTS:4], order[-_MAX_MAP_DOTS:]])[-2 * _MAX_MAP_DOTS :]
             values, at = layer.values[finite][order], position[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
+            count = (
+                "" if len(values) == (of := finite.sum()) else f" ({len(values)} of {of}, largest included)"
+            )
+            series = f"_{LAYER_LABELS[layer.key]} [{layer.unit}]{count}"  # in the CSV only
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(
                     at[:, a], at[:, b], c=values, s=2 + 16 * values / top, cmap="cividis_r", vmin=0.0, vmax=top,
-                    linewidths=0, rasterized=len(values) > _MANY_DOTS,
+                    label=series, linewidths=0, rasterized=len(values) > _MANY_DOTS,
                 )  # fmt: skip
                 axes.set_aspect("equal", "datalim")
                 axes.set(xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")

@@ -1,10 +1,14 @@
 """All pages, made once: no NaN, nothing from elsewhere, accessible, and as wide as a phone."""
 
+import csv
+import io
 import re
+from collections import Counter
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from testing.aged import original_model, rows_after_change
@@ -16,9 +20,10 @@ from testing.report import folder_with_held_out, hybrid_under_test
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.drawing import csv_of
-from pisigma.reporting.page.figures import draw_figures
+from pisigma.reporting.page.figures import draw_figures, draw_map
 from pisigma.reporting.page.lifetime import fleet_page
 from pisigma.reporting.page.page import render_page
+from pisigma.validation.report.error_map import Layer
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.compare import compare
 from pisigma.workflow.monitor import monitor
@@ -104,3 +109,14 @@ def test_the_values_of_a_figure_are_those_drawn():
         "RMS,3,0.3,,",
         "bins,,5,0,2",
     ]
+
+
+def test_every_value_of_a_map_has_its_quantity_and_unit():
+    layers = [Layer("before", "mm", np.arange(1.0, 9002.0)), Layer("after_deg", "deg", np.arange(2.0))]
+    layers[1] = replace(layers[1], values=np.resize([7.0, np.nan], 9001))
+    drawn = csv_of(draw_map("map", "map", "Errors", np.zeros((9001, 3)), layers).figure)
+    series = Counter(row["series"] for row in csv.DictReader(io.StringIO(drawn)))
+    assert series == {
+        "before (nominal) [mm] (3000 of 9001, largest included)": 6000,
+        "orientation, after [deg] (2251 of 4501, largest included)": 4502,
+    }
