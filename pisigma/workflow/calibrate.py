@@ -1,5 +1,6 @@
 """Calibrate a robot from measurements."""
 
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -282,6 +283,8 @@ def calibrator_of(
     length, angle = settings.prior_length, settings.prior_angle
     usual = _class_of(settings, robot)
     zeros = max(angle, usual.prior_sizes.joint_offset) if usual is SERVO else angle
+    # An error that several distances share is not averaged out by them.
+    shared = math.sqrt(len(distances) / max(len(settings.socket_distances), 1)) or 1.0
     geometric = GeometricCalibrator(
         robot,
         free=settings.free,
@@ -289,6 +292,7 @@ def calibrator_of(
         loss=HampelLoss() if settings.robust else SquaredLoss(),
         robot_class=settings.robot_class,
         socket_distances=dict(distances),
+        socket_sigma=settings.socket_sigma * shared,
     )
     if settings.model != "hybrid":
         return geometric

@@ -20,6 +20,7 @@ _CALIBRATE = {
     "--split": (*_WORDS, "time", "space", "placement"), "--set=repeats": _COUNTS,
     "--set=seed": (*_COUNTS, "-9223372036854775809"), "--set=train_rows": (*_COUNTS, "5"), "--set=prior_mm": _NUMBERS,
     "--set=prior_mrad": _NUMBERS, "--set=free": (*_WORDS, "a_2,a_2", "a_99", ",", "theta_1"), "--model": _WORDS,
+    "--set=socket_sigma_mm": _NUMBERS,
     "--set=socket_distance": (*_WORDS, "a,b", "a,b,-1", "*,*,50", "a,b,nan", "*/0,*/1,1e300", "(,),1"),
     "--base": _WORDS, "--tip": _WORDS, "--set": (*_WORDS, "fold=3", "=", "seed=1", "folds=0"),
 }  # fmt: skip

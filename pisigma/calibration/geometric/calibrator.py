@@ -130,7 +130,7 @@ class GeometricCalibrator:
                     expected=f"six finite numbers for '{name}': x, y, z [m], roll, pitch, yaw [rad]",
                     value=tuple(base),
                 )
-        if not self.socket_sigma > 0:
+        if not 0 < self.socket_sigma < math.inf:
             raise IdentificationError(
                 option="socket_sigma", expected="a standard deviation > 0 m", value=self.socket_sigma
             )

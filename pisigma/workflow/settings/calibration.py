@@ -117,6 +117,8 @@ class CalibrationSettings:
         new_frame_at: first line measured after the instrument was moved; the rows from there on are in a new frame.
         socket_distances: known distances [m] by the names of two sockets, such as {("*/0", "*/1"): 0.05}. An asterisk
             stands for the same text in both names, here for every placement.
+        socket_sigma: standard deviation of the known distances between sockets [m]. All distances that one entry with
+            an asterisk states have the same error, because they are those of one plate.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:
@@ -147,6 +149,7 @@ class CalibrationSettings:
     ] = None
     new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
     socket_distances: SocketDistances = field(default_factory=dict)
+    socket_sigma: Annotated[float, Option("--socket-sigma-mm", unit="mm", is_key=True)] = 1e-5
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
