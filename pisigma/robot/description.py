@@ -136,6 +136,11 @@ class Robot:
         """Convert joint values `(*batch, dof)` to the controller's values `(*batch, axes)`, both [rad or m]."""
         return q if self.coupling is None else self.coupling.to_controller(q)
 
+    def in_file_units(self, q: Any) -> Float64[np.ndarray, "*batch axes"]:
+        """Convert joint values `(*batch, dof)` [rad or m] to the controller's values of `axes` [deg or mm]."""
+        per_si = [math.degrees(1.0) if axis.type == "revolute" else 1e3 for axis in self.axes]
+        return np.asarray(self.to_controller(np.asarray(q, dtype=np.float64))) * per_si
+
     @property
     def limits(self) -> Float64[np.ndarray, " dof 2"]:
         """Lower and upper limit of every joint [rad or m]; for a coupled joint, the range that the axes allow."""

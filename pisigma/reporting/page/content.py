@@ -6,8 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pisigma.files.model_files import CORRELATION_CSV, CORRELATION_PNG
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -123,8 +121,10 @@ def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
     if rows is None or largest is None:
         return "", ""
     joints = [
-        f"{np.degrees(value):.1f} deg" if turns else f"{value * 1e3:.1f} mm"
-        for value, turns in zip(rows.measurements.q.numpy()[largest.row], model.robot.revolute, strict=True)
+        f"{value:.1f} {axis.file_unit}"
+        for value, axis in zip(
+            model.robot.in_file_units(rows.measurements.q[largest.row]), model.robot.axes, strict=True
+        )
     ]
     at = [round(value * 1e3) for value in largest.position]
     (row,) = say("worst_row", rows, largest, at, joints)

@@ -116,8 +116,7 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
         "numbering": _packed(numbers_of_names(error_map.numbering)),
         "q": _packed(error_map.q),
         "joints": [
-            {"name": joint.name, "unit": "°" if turns else "mm"}
-            for joint, turns in zip(robot.joints, robot.revolute, strict=True)
+            {"name": axis.name, "unit": "°" if axis.type == "revolute" else "mm"} for axis in robot.axes
         ],
         "frames": list(dict.fromkeys(error_map.frame)),
         "frame": _packed(numbers_of_names(error_map.frame)),

@@ -74,13 +74,17 @@ class HeldOutRows:
     def to_csv(self, robot: Robot) -> str:
         """Write CSV text with joint values, frame, target, and the errors under every model in mm and deg.
 
+        Columns of coupled joints are named q1_dh_deg and so on, because they are not the controller's values.
+
         Args:
             robot: the robot, for the units of revolute (deg) and prismatic (mm) joints.
         """
         columns: dict[str, list[str]] = {}
         for j, revolute in enumerate(robot.revolute):
             factor, unit = (_DEGREES, "deg") if revolute else (1e3, "mm")
-            columns[f"q{j + 1}_{unit}"] = [f"{value:.10g}" for value in (self.q[:, j] * factor).tolist()]
+            columns[f"q{j + 1}_{'dh_' if robot.coupling else ''}{unit}"] = [
+                f"{value:.10g}" for value in (self.q[:, j] * factor).tolist()
+            ]
         columns |= {"frame": list(self.frame), "target": list(self.target)}
         columns |= {"file": list(self.origin)} if self.origin else {}
         columns |= {"line": list(map(str, self.line))} if any(self.line) else {}

@@ -211,14 +211,12 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
     before, after, unit = error_lengths(rows)
     judged = np.isfinite(after)
     errors = {"before": before[judged], "after": after[judged]}
-    q = rows.measurements.q.numpy()[judged]
+    q = robot.in_file_units(rows.measurements.q)[judged]
     groups = groups_of_equal_joints(rows.measurements.q).numpy()[judged]
     result = []
-    for j, joint in enumerate(robot.joints):
-        factor, joint_unit = (_DEGREES, "deg") if robot.revolute[j] else (1e3, "mm")
-        values = q[:, j] * factor
+    for number, (axis, values) in enumerate(zip(robot.axes, q.T, strict=True), 1):
         test = _over_joint(values, errors["after"], groups)
-        result.append(Dependence(f"joint_{j + 1}", joint.name, joint_unit, values, errors, unit, test))
+        result.append(Dependence(f"joint_{number}", axis.name, axis.file_unit, values, errors, unit, test))
     result.append(_over_order(rows, errors, judged, unit))
     conditions = conditions_of(rows.measurements, CONDITIONS).numpy()[judged]
     for name, values in zip(CONDITIONS, conditions.T, strict=True):

@@ -62,7 +62,7 @@ class ErrorMap:
         layers: quantities that can be shown, at least one.
         row: line of every point's row in the file, or else the number of the row from 1; 0 for samples.
         numbering: what `row` counts at every point: "line", "b.csv, line" if the rows are of several files, or "row".
-        q: joint values [deg or mm].
+        q: the controller's values of the axes [deg or mm].
         frame: frame of every point.
         target: target of every point.
         is_inside_range: whether every joint value was measured for the calibration.
@@ -76,7 +76,7 @@ class ErrorMap:
     layers: tuple[Layer, ...]
     row: Int64[np.ndarray, " points"]
     numbering: tuple[str, ...]
-    q: Float64[np.ndarray, "points dof"]
+    q: Float64[np.ndarray, "points axes"]
     frame: tuple[str, ...]
     target: tuple[str, ...]
     is_inside_range: Bool[np.ndarray, " points"]
@@ -158,7 +158,6 @@ def _map(
     number: Int64[Tensor, " points"],
     about: tuple[int, str, str, int],
 ) -> ErrorMap:
-    factor = [math.degrees(1.0) if revolute else 1e3 for revolute in model.robot.revolute]
     return ErrorMap(
         tool_positions(model, points.q).numpy() * 1e3,
         tuple(layers),
@@ -167,7 +166,7 @@ def _map(
             f"{name}, line" if line and name else "line" if line else "row"
             for line, name in zip(points.line, points.origin or ("",) * points.rows, strict=True)
         ),
-        points.q.numpy() * factor,
+        model.robot.in_file_units(points.q),
         points.frame,
         points.target,
         is_inside_range(model, points.q).numpy(),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.coupled import coupled_robot
 from testing.models import hand_made_model
 from testing.refusals import refused
 from testing.report import bare_summary
@@ -21,6 +22,7 @@ from pisigma.validation.held_out.calibration_validation import CalibrationValida
 from pisigma.validation.held_out.held_out_rows import HeldOutRows, read_held_out
 from pisigma.validation.held_out.judged_rows import rows_of_folder
 from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread
+from pisigma.validation.report.dependence import dependences
 from pisigma.validation.report.error_map import largest_errors, map_of_rows
 
 ROWS = 20
@@ -95,6 +97,20 @@ def test_rows_of_a_report_are_named_by_file_and_line(measured, tmp_path):
     assert shown.numbering == ("first.csv, line", "second.csv, line") * (ROWS // 2)
     worst = largest_errors(rows).row
     assert rows.measurements.place_of(worst) == RowPlace(origin[worst][3:], line[worst])
+
+
+def test_joint_values_of_a_report_are_those_of_the_controller(tmp_path):
+    model = hand_made_model("kiro4", robot=coupled_robot())
+    q = model.starts[:ROWS]
+    text, model = _kept(model, _validation(ROWS, False, False), Measurements(q=q))
+    (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
+    rows = rows_of_folder(model, read_held_out(tmp_path, model))
+    assert_close(rows.measurements.q, q, rtol=1e-9)
+    shown = np.rad2deg(model.robot.to_controller(q.numpy()))
+    assert_close(map_of_rows(model, rows).q, shown, atol=1e-7)
+    third = dependences(rows, model.robot)[2]
+    assert_close(third.values, shown[:-1, 2], atol=1e-7)  # the last row has no error
+    assert "q3_dh_deg" in text.splitlines()[0].split(",")
 
 
 def test_columns_bear_their_units(measured):
