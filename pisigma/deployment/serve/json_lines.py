@@ -24,7 +24,14 @@ from pisigma.deployment.serve.protocol import (
     read_numbers,
     read_tolerance,
 )
-from pisigma.files.errors import PisigmaError, RequestError, check_choice, make_printable, nearest_choice
+from pisigma.files.errors import (
+    PisigmaError,
+    RequestError,
+    check_choice,
+    make_printable,
+    missing_extra,
+    nearest_choice,
+)
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import xyzrpy_of
 from pisigma.robot.kinematics.status import Status
@@ -203,6 +210,8 @@ class JsonLines(AbstractProtocol):
 
     def _refuse(self, request: dict[str, Any], problem: Exception, begun: int) -> bytes:
         """Return the answer to an invalid request, with the id of the request if it could be read."""
+        if isinstance(problem, ImportError):
+            problem = missing_extra(problem) or problem
         if isinstance(problem, PisigmaError | ValueError):
             sentence = make_printable(str(problem))
         elif isinstance(problem, RecursionError):

@@ -15,6 +15,7 @@ from testing.serving import json_client, running
 
 import pisigma
 from pisigma.deployment.serve import json_lines
+from pisigma.files.errors import missing_extra
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
@@ -253,3 +254,15 @@ def test_the_example_of_the_documentation_is_answered_as_documented(repository):
                     assert_close(answer[key], value, atol=5e-5)
                 else:
                     assert answer[key] == value
+
+
+def test_a_package_that_is_not_installed_is_no_defect(ask, monkeypatch):
+    problem = ModuleNotFoundError(name="torch")
+
+    def forward(*_):
+        raise problem
+
+    monkeypatch.setattr(json_lines, "_forward", forward)
+    with pytest.raises(RuntimeError) as refusal:
+        ask(q_deg=NEAR, model="kiro4")
+    assert str(refusal.value) == str(missing_extra(problem))
