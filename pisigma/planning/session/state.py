@@ -202,11 +202,19 @@ class SessionState:
                 "count": following.count,
                 "set": "test" if following.check else "train",
                 "joints": self.in_file_units(following.controller_values),
+                "units": ["deg" if turns else "mm" for turns in self.revolute],
             },
             "coverage": [
-                {"joint": span.name, "lower": lower, "upper": upper, "share_of_plan": span.planned}
-                for span, lower, upper in zip(
+                {
+                    "joint": span.name,
+                    "unit": "deg" if turns else "mm",
+                    "lower": lower,
+                    "upper": upper,
+                    "share_of_plan": span.planned,
+                }
+                for span, turns, lower, upper in zip(
                     self.coverage,
+                    self.revolute[: len(self.coverage)],
                     self.in_file_units([span.lower for span in self.coverage]),
                     self.in_file_units([span.upper for span in self.coverage]),
                     strict=True,

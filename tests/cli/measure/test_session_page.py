@@ -9,6 +9,7 @@ from testing.sessions import arm_with_tracker, session_state
 
 from pisigma.cli.measure.command import PageOptions, serve_session_page
 from pisigma.files.errors import RobotError, missing_extra
+from pisigma.robot.description import Robot
 
 OPTIONS = PageOptions("127.0.0.1", 8080, None)
 
@@ -44,3 +45,10 @@ def test_meshes_that_cannot_be_shown_are_refused(tmp_path):
         serve_session_page(arm_with_tracker(), None, options),
     ):
         pass
+
+
+def test_joint_values_in_json_have_units():
+    with no_type_checker():
+        figures = session_state(arm_with_tracker(Robot.load("kiro3")), 3).to_json()
+    units = ["deg", "deg", "mm", "deg"]
+    assert [joint["unit"] for joint in figures["coverage"]] == figures["next_pose"]["units"] == units
