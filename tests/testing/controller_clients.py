@@ -132,6 +132,10 @@ def run_urscript(text: str, q_now: Sequence[float]) -> dict[str, Callable[..., o
             received += sockets[name].recv(1)
         return received.decode().rstrip("\n")
 
+    def floor(value: float) -> int:
+        assert abs(value) < 2**31, "URScript has integers of 32 bits"
+        return math.floor(value)
+
     def as_text(value: float) -> str:
         return str(value) if isinstance(value, int) else f"{value:.6g}"
 
@@ -147,7 +151,7 @@ def run_urscript(text: str, q_now: Sequence[float]) -> dict[str, Callable[..., o
         "str_sub": lambda words, start, length: words[start : start + length],
         "to_num": float,
         "to_str": as_text,
-        "floor": math.floor,
+        "floor": floor,
         "d2r": math.radians,
         "r2d": math.degrees,
         "rotvec2rpy": _roll_pitch_yaw,
