@@ -1,10 +1,9 @@
-"""The documentation agrees with the code: commands, snippets, links, figures, columns, recipe keys."""
+"""The documentation agrees with the code: commands, links, figures, columns, recipe keys; see also `test_examples`."""
 
 import ast
 import importlib.util
 import inspect
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -119,52 +118,6 @@ def test_commands_and_options_within_sentences_exist() -> None:
                 looked_at += 1
                 assert words[0] in every, f"{_name(page)}: there is no option in `{span}`"
     assert looked_at > 20
-
-
-RUNNABLE = [page for page in PAGES if "<!-- runs -->" in _text(page)]
-
-
-RUN_ALL = """import json, os, runpy, sys, traceback
-faults = {}
-for page in sys.argv[1:]:
-    os.chdir(os.path.join(sys.path[0], page))
-    try:
-        runpy.run_path("snippets.py", run_name="__main__")
-    except BaseException:
-        faults[page] = traceback.format_exc()
-os.chdir(sys.path[0])
-print("\\n" + json.dumps(faults))
-"""
-"""Program that runs the snippets of every page in a separate folder; one process, as imports take most of the time."""
-
-
-@pytest.fixture(scope="module")
-def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return tracebacks of the pages with failing snippets, with warnings as errors, by the number of the page."""
-    folder = tmp_path_factory.mktemp("snippets")
-    (folder / "run_all.py").write_text(RUN_ALL)
-    for number, page in enumerate(RUNNABLE):
-        blocks = re.findall(
-            r"<!-- runs -->\n+```python\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL
-        )
-        assert len(blocks) == _text(page).count("<!-- runs -->")
-        (folder / str(number)).mkdir()
-        (folder / str(number) / "models").symlink_to(ROOT / "models")
-        (folder / str(number) / "snippets.py").write_text("\n".join(blocks), encoding="utf-8")
-    command = [sys.executable, "-W", "error", str(folder / "run_all.py"), *map(str, range(len(RUNNABLE)))]
-    paths = filter(None, (str(ROOT / "training" / "papers"), os.environ.get("PYTHONPATH")))
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    result: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
-    return result
-
-
-@pytest.mark.parametrize("page", RUNNABLE, ids=_name)
-def test_snippets_that_are_marked_run(page: Path, faults: dict[str, str]) -> None:
-    """Run all snippets of a page together, as a reader does."""
-    fault = faults.get(str(RUNNABLE.index(page)))
-    assert fault is None, f"{_name(page)}: {fault}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
