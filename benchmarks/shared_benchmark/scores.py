@@ -115,7 +115,7 @@ def _samples(several: list[RowErrors]) -> tuple[Array, list[Array]]:
     ]
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _draws(groups: int) -> Array:
     """Return how often every bootstrap sample contains every group; as floats, which are multiplied by BLAS."""
     draws = np.random.default_rng(0).multinomial(groups, np.full(groups, 1 / groups), DRAWS)
