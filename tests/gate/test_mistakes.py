@@ -1,6 +1,6 @@
-"""The common check of all commands notices forty mistakes in rows; five of them go through every command.
+"""The common check of all commands notices mistakes in rows; a mistake of every kind goes through every command.
 
-`python tests/gate/run.py mistakes` runs every command with all of them.
+`python tests/gate/run.py mistakes` runs every command with all forty.
 """
 
 import pytest
@@ -15,14 +15,31 @@ from pisigma.validation.gate import check_rows
 
 pytestmark = pytest.mark.usefixtures("without_type_checker", "quick", "blank_pictures")
 
-EVERYWHERE = (
-    "metres named mm",
-    "sign of q5",
-    "half in inches",
-    "tracker moved by 2 mm half-way",
-    "lengths x 1.001",
-)
-"""Mistakes of five kinds: a unit, mixed rows, a wrong scale, and others that siblings could judge apart."""
+EVERYWHERE = {
+    "sign of q5": COMMANDS,
+    "tracker moved by 2 mm half-way": COMMANDS,
+    "lengths x 1.001": COMMANDS,
+    "metres named mm": list(COMMANDS)[::2],
+    "half in inches": list(COMMANDS)[1::2],
+}
+"""Commands by mistake: all for a setup fault, mixed rows and a scale; half of them each for two wrong units."""
+ALIKE = {
+    "mm named m",
+    "feet named mm",
+    "radians named degrees",
+    "sign of q2",
+    "sign of q3",
+    "sign of q4",
+    "q2 and q3 swapped",
+    "q5 and q6 swapped",
+    "two robots, one after the other",
+    "half mirrored",
+    "tracker carried by 100 mm half-way",
+    "lengths x 0.999",
+    "lengths x 1.01",
+    "rows of a UR10",
+}
+"""Mistakes that another one of the table resembles: the same unit, joints or mixture with other numbers."""
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +48,9 @@ def quick():
         yield
 
 
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    "mistake", [one for one in MISTAKES if one.name not in ALIKE], ids=lambda one: one.name
+)
 def test_the_check_notices(mistake):
     found = check_rows(
         mistake.change(filtered_rows()), original_model(), allowed_moves=row_check.MOVES
@@ -61,7 +80,7 @@ def test_wrong_rows_are_named():
 @pytest.mark.parametrize("name", EVERYWHERE)
 def test_commands_agree(name, tmp_path):
     (mistake,) = (one for one in MISTAKES if one.name == name)
-    assert disagreements(mistake, tmp_path) == []
+    assert disagreements(mistake, tmp_path, EVERYWHERE[name]) == []
 
 
 def test_every_command_accepts_right_rows(tmp_path):
