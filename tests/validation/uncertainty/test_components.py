@@ -8,6 +8,7 @@ import torch
 from testing.aged import original_model, rows_after_change
 from testing.cell_rows import ROBOT
 from testing.closeness import assert_close
+from testing.hybrid import few_choices
 from testing.models import no_type_checker
 from testing.simulated_arm import BASE, TOOL, dh_errors, draw_joints
 
@@ -110,7 +111,7 @@ def test_the_expanded_uncertainty_covers_true_errors():
         measured = (
             center + scale * (attained - center) + NOISE * torch.from_numpy(rng.normal(size=attained.shape))
         )
-        with no_type_checker():
+        with no_type_checker(), few_choices():
             model = calibrate(
                 "ur10", Measurements(q=q, position=measured), CalibrationSettings(folds=0)
             ).model
