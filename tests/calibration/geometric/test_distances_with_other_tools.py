@@ -38,8 +38,9 @@ def with_tool_off(off: float) -> Robot:
     return nominal.with_geometry(tool=tool)
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("off", [0.0, 0.137, 0.3])
+@pytest.mark.parametrize(
+    ("sensor", "off"), [*((one, 0.137) for one in SENSORS), ("wire", 0.0), ("pair", 0.3)]
+)
 def test_a_tool_that_is_not_nominal_is_found(sensor: str, off: float) -> None:
     result = GeometricCalibrator(with_tool_off(off)).fit(SENSORS[sensor]())
     assert result.status.is_minimum
@@ -58,8 +59,7 @@ def seen_from(T_frame_robot: Tensor, anchors: int) -> Measurements:
     return Measurements(q=q, distance=distance, anchor=names, anchor_place=stated[number])
 
 
-@pytest.mark.parametrize("anchors", [1, 2, 3])
-@pytest.mark.parametrize("off", [0.137, 1.0])
+@pytest.mark.parametrize(("anchors", "off"), [(1, 0.137), (2, 1.0), (3, 1.0)])
 def test_neither_a_far_frame_nor_a_long_tool_has_to_be_drawn(anchors: int, off: float) -> None:
     T = transform_from_xyzrpy(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
     nominal = with_tool_off(off)
@@ -108,9 +108,12 @@ def test_distances_in_another_unit_are_refused(sensor: str, factor: float, off: 
         GeometricCalibrator(with_tool_off(off)).fit(replace(data, distance=data.distance * factor))
 
 
-@pytest.mark.parametrize(("robot", "factor", "unit"), [("ur10", 1e-3, "metres"), ("ur5", 1 / 25.4, "inches")])
+@pytest.mark.parametrize(
+    ("robot", "tool", "factor", "unit"),
+    [("ur10", "free", 1e-3, "metres"), ("ur5", "fixed", 1 / 25.4, "inches")],
+)
 def test_wires_of_measured_robots_in_another_unit_are_refused(
-    robot: str, factor: float, unit: str, shared_data: Path
+    robot: str, tool: str, factor: float, unit: str, shared_data: Path
 ) -> None:
     name = {"ur10": "ur10/series_c_train.csv", "ur5": "ur5/grid.csv"}[robot]
     rows = Measurements.read_csv(shared_data / name).select(torch.arange(0, 900, 3))
@@ -118,12 +121,11 @@ def test_wires_of_measured_robots_in_another_unit_are_refused(
     lengths = (rows.position - rows.position.mean(0) - torch.tensor([1.2, 0.8, 0.9])).norm(dim=-1)
     data = Measurements(q=rows.q, distance=lengths, anchor=("wall",) * rows.rows)
     assert GeometricCalibrator(Robot.load(robot)).fit(data).noise[0].sigma < 3e-4
-    for tool in ("free", "fixed"):
-        with refused(ImplausibleError, value=unit):
-            GeometricCalibrator(Robot.load(robot), tool=tool).fit(replace(data, distance=lengths * factor))
+    with refused(ImplausibleError, value=unit):
+        GeometricCalibrator(Robot.load(robot), tool=tool).fit(replace(data, distance=lengths * factor))
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1 / 25.4, 25.4, 1e3])
+@pytest.mark.parametrize("factor", [1e-3, 25.4])
 def test_stated_distances_of_sockets_in_another_unit_are_refused(factor: float) -> None:
     wrong = {sockets: distance * factor for sockets, distance in SOCKETS.items()}
     with pytest.raises(IdentificationError):

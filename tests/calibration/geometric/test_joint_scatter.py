@@ -18,8 +18,10 @@ def estimated_scatter(rows):
     return result.solved.setup.joint_repeatability * corner_factor(rows, noise)
 
 
-@pytest.mark.parametrize("degrees", [0.3, 1.0])
-@pytest.mark.parametrize("shared", [Repeatability(0.0, 0.0), Repeatability(5e-4, np.deg2rad(0.15))])
+@pytest.mark.parametrize(
+    ("degrees", "shared"),
+    [(1.0, Repeatability(0.0, 0.0)), (0.3, Repeatability(5e-4, np.deg2rad(0.15)))],
+)
 def test_scatter_is_estimated(degrees, shared):
     true, q, random = arm_before_phone(3)
     rows = rows_of_phone(true, q[:60], random, 3, np.deg2rad(degrees), shared)
