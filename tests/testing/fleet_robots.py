@@ -1,9 +1,15 @@
 """Simulated robots of one type, with shared and individual errors."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
 import torch
 from torch import Tensor
 
+from pisigma.estimation import population
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.lifetime.fleet import prior
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -16,6 +22,20 @@ SHARED, INDIVIDUAL = 1e-3, 2e-4
 """Standard deviations of the shared and of the individual geometric errors [m or rad]."""
 GEARS = (2e-4, 1e-4, 0.0)
 """Standard deviations of the harmonics of gears [rad]."""
+
+
+@contextmanager
+def few_steps() -> Iterator[None]:
+    """Estimate fleet priors with a twentieth of the steps, for tests of other subjects."""
+    whole = population.expectation_maximisation
+
+    def with_few(evidence, start, class_variances, class_robots=population._CLASS_ROBOTS, steps=0):
+        return whole(evidence, start, class_variances, class_robots, steps=3)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prior, "LINEARISATIONS", 1)
+        patch.setattr(population, "expectation_maximisation", with_few)
+        yield
 
 
 def common_errors(seed: int = 5) -> Tensor:

@@ -49,7 +49,8 @@ def test_a_calibration_in_processes_gives_the_same(tasks, stated, count):
 
 def test_a_training_in_processes_gives_the_same(tasks):
     recipe, run = trained_run("kiro4")
-    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=3, seed=0)})
+    data, fit = MeasuredData(kind="measured", folds=3, seed=0), recipe.fit.model_copy(update={"epochs": 8})
+    measured = recipe.model_copy(update={"data": data, "fit": fit})
     with no_type_checker():
         here, there = (
             pisigma.train(measured, run.measurements, TrainSettings(jobs=jobs)) for jobs in (None, 2)

@@ -25,13 +25,13 @@ def with_one_far_off(rows: Measurements) -> Measurements:
 
 @pytest.mark.parametrize("base", [(0.0,) * 6, (0.4, 0.2, 0.0, 0.0, 0.0, 0.3)], ids=["there", "moved"])
 def test_monitor_uses_the_other_rows(base):
-    rows = rows_after_change(24, 3, base=base)
+    rows = rows_after_change(16, 3, base=base)
     with no_type_checker():
         done = monitor(original_model(), [with_one_far_off(rows)])
         alone = monitor(original_model(), [rows])
     assert done.untrusted_sessions == ()
     (session,), (right,) = (one.sessions for one in (done, alone))
-    assert session.session.rows == 23
+    assert session.session.rows == 15
     assert session.session.verdict == right.session.verdict
     assert abs(session.session.rms - right.session.rms) < 5e-5
     assert sum("rows.csv, line 7" in one for one in done.warnings) == 1
@@ -49,6 +49,6 @@ def test_report_uses_the_other_rows(tmp_path):
 
 def test_recalibrate_uses_the_other_rows():
     with no_type_checker():
-        done = recalibrate(original_model(), with_one_far_off(rows_after_change(24, 3)))
+        done = recalibrate(original_model(), with_one_far_off(rows_after_change(12, 3)))
     assert done.trusted
     assert [one.row for one in done.summary.outliers] == [WRONG]

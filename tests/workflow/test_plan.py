@@ -108,7 +108,6 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     [
         (6, 1.0, "setup_fault"),
         (20, 1e3, "other_robot"),
-        (60, 1e3, "other_robot"),
     ],
 )
 def test_measurements_that_cannot_be_of_the_robot_are_refused(
@@ -117,7 +116,7 @@ def test_measurements_that_cannot_be_of_the_robot_are_refused(
     """They are a few rows in another unit, and many of another robot."""
     robot = Robot.load("ur5")
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 4 - 2
-    measured = {6: "ur5", 20: "ur5e", 60: "rb5"}[rows]
+    measured = {6: "ur5", 20: "ur5e"}[rows]
     position = forward_kinematics(Robot.load(measured), q)[:, :3, 3] * scale
     lines = torch.cat([torch.rad2deg(q), position], 1).tolist()
     header = ",".join([*(f"q{joint}_deg" for joint in range(1, 7)), "x_mm", "y_mm", "z_mm"])
@@ -188,7 +187,7 @@ def test_all_poses_are_planned_in_the_part_of_the_free_space_that_contains_the_t
         {"name": f"wall {side}", "center_mm": (side * 3200, 0, 1500), "size_mm": (6000, 40, 3000)}
         for side in (-1, 1)
     ]
-    settings = PlanSettings(count=12, check=4, candidates=300, limit_mm=2.0)
+    settings = PlanSettings(count=8, check=2, candidates=120, limit_mm=2.0)
     if task_in_front is not None:
         q = draw_candidates(ArmInSurroundings.from_robot(Robot.load("kiro3")), 60, 1).q
         q = q[(q[:, 0] > 0) == task_in_front]
@@ -198,8 +197,8 @@ def test_all_poses_are_planned_in_the_part_of_the_free_space_that_contains_the_t
         settings = replace(settings, task=tmp_path / "task.csv")
     planned = plan("kiro3", settings, CELL.model_validate({"boxes": boxes}))
     q = planned.stored_plan.q
-    assert len(q) == 16
-    assert int(planned.stored_plan.check.sum()) == 4
+    assert len(q) == 10
+    assert int(planned.stored_plan.check.sum()) == 2
     assert len(q[:, 0].sign().unique()) == 1
     assert task_in_front is None or bool((q[0, 0] > 0) == task_in_front)
     assert len(planned.warnings) >= 1

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from testing.aged import original_model, rows_after_change
+from testing.fleet_robots import few_steps
 from testing.identified import geometric_model
 from testing.models import no_type_checker
 
@@ -94,7 +95,7 @@ def test_a_fleet_prior_warns_and_widens(tmp_path):
         rows.write_csv(tmp_path / f"r{number}.csv", arm)
         lines.append(f"r{number},arm.yaml,r{number}.csv")
     (tmp_path / "fleet.csv").write_text("\n".join(lines) + "\n")
-    with no_type_checker():
+    with no_type_checker(), few_steps():
         new_cells(tmp_path / "fleet.csv", tmp_path / "cells", NewCell(""))
         prior = estimate_fleet_prior(tmp_path / "cells")
     assert sum("'theta_3'" in one for one in prior.summary.warnings) == 5

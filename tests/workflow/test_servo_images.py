@@ -15,8 +15,8 @@ def arm():
     model = pisigma.calibrate("so101", rows, pisigma.CalibrationSettings(folds=0)).model
     dh = true.dh.copy()
     dh[JOINT, 0] += MOVED
-    unchanged = rows_of_phone(true, later[:20], np.random.default_rng(7), 7)
-    moved = rows_of_phone(true.with_geometry(dh), later[20:40], np.random.default_rng(8), 8)
+    unchanged = rows_of_phone(true, later[:12], np.random.default_rng(7), 7)
+    moved = rows_of_phone(true.with_geometry(dh), later[20:32], np.random.default_rng(8), 8)
     return model, rows, unchanged, moved
 
 

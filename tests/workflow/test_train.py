@@ -63,8 +63,8 @@ def test_options_that_a_recipe_does_not_use_are_refused(repository, recipe, sett
 def test_rows_that_are_left_out_are_a_warning():
     recipe, run = trained_run("kiro4")
     singular = SingularRows(rule="leave_out", below=0.06)
-    data = MeasuredData(kind="measured", folds=5, seed=0)
-    measured = recipe.model_copy(update={"data": data, "singular_rows": singular})
+    data, fit = MeasuredData(kind="measured", folds=5, seed=0), recipe.fit.model_copy(update={"epochs": 8})
+    measured = recipe.model_copy(update={"data": data, "singular_rows": singular, "fit": fit})
     with no_type_checker():
         training = pisigma.train(measured, run.measurements)
     assert training.validation.folds == 5
@@ -108,7 +108,8 @@ def test_a_simulated_recipe_has_held_out_rows_of_its_own():
 
 def test_rows_of_the_test_set_do_not_change_the_model():
     recipe, run = trained_run("kiro3")
-    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=2, seed=0)})
+    data, fit = MeasuredData(kind="measured", folds=2, seed=0), recipe.fit.model_copy(update={"epochs": 8})
+    measured = recipe.model_copy(update={"data": data, "fit": fit})
     everything = run.measurements
     split = tuple("test" if row % 4 == 0 else "train" for row in range(everything.rows))
     position = everything.position.clone()

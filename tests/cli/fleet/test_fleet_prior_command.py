@@ -4,12 +4,11 @@ import json
 
 import pytest
 from testing.engine_work import PicklingEngine
-from testing.fleet_robots import NOMINAL, rows_of
+from testing.fleet_robots import NOMINAL, few_steps, rows_of
 from testing.models import REPOSITORY
 from testing.screens import assert_screen
 
 from pisigma.files.errors import ModelError, PisigmaError
-from pisigma.lifetime.fleet import prior as fleet_prior
 from pisigma.model.folder.model_folder import load_model
 from pisigma.workflow.fleet import run as workflow
 
@@ -34,8 +33,7 @@ def prior(tmp_path_factory, run):
     assert run("new", "rb5", "--from", folder / "in", "--out", cells).exit_code == 0
     (cells / "bad_robot" / "cell.yaml").write_text("robot: robot.yaml\n", encoding="utf-8")
     (cells / "bad_robot" / "robot.yaml").write_text("name: 3\n", encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fleet_prior, "LINEARISATIONS", 1)
+    with few_steps():
         made = run("fleet", "prior", cells, "--out", folder / "prior")
     assert made.exit_code == 0, made.output
     return folder, made

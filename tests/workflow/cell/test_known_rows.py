@@ -46,15 +46,15 @@ def test_rows_of_a_model_from_outside_of_the_cell_are_refused_with_others(used, 
     assert other.history.in_use.made_of == (session.name,)
 
 
-@pytest.mark.parametrize("name", [day(60), day(40)])
-def test_a_session_that_is_not_new_to_the_model_is_refused_by_its_name(name, cell):
+def test_a_session_that_is_not_new_to_the_model_is_refused_by_its_name(cell):
     cell.add_session(measured(12, 6), day=day(40))
     cell.add_session(measured(12, 7), day=day(20))
     model, _ = cell.recalibrate(session=day(30))
     assert model.trusted
     for step in (cell.verify, cell.recalibrate):
-        with refused(MeasurementError, value=name):
-            step(session=name)
+        for name in (day(60), day(40)):
+            with refused(MeasurementError, value=name):
+                step(session=name)
 
 
 def test_a_session_has_the_first_of_its_stated_days(cell):
