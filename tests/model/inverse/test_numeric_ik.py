@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("without_type_checker")
 def without_kernels():
     """An arm whose correction has features without a compiled form, with joint values and poses."""
     model = calibrated_arm("ur5", shared=("pose",))
-    q = joints_of(model.robot, 24, seed=7)
+    q = joints_of(model.robot, 8, seed=7)
     return CorrectedIK(model), q, model.forward(q)
 
 
@@ -35,7 +35,7 @@ def test_a_model_without_kernels_is_solved(without_kernels, way):
     assert ik.compiled is None
     options = {"near": {"near": q + 0.01}, "branch": {"branch": ik.branches[1]}}.get(way, {})
     tensors = ik(
-        T.reshape(4, 6, 4, 4), **{k: v.reshape(4, 6, 6) if k == "near" else v for k, v in options.items()}
+        T.reshape(2, 4, 4, 4), **{k: v.reshape(2, 4, 6) if k == "near" else v for k, v in options.items()}
     )
     arrays = ik(T.numpy(), **options)
     reached = arrays.status != Status.UNREACHABLE
