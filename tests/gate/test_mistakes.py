@@ -16,13 +16,13 @@ from pisigma.validation.gate import check_rows
 pytestmark = pytest.mark.usefixtures("without_type_checker", "quick", "blank_pictures")
 
 EVERYWHERE = {
-    "sign of q5": COMMANDS,
-    "tracker moved by 2 mm half-way": COMMANDS,
     "lengths x 1.001": COMMANDS,
-    "metres named mm": list(COMMANDS)[::2],
-    "half in inches": list(COMMANDS)[1::2],
+    "sign of q5": list(COMMANDS)[::2],
+    "half in inches": list(COMMANDS)[::2],
+    "metres named mm": list(COMMANDS)[1::2],
+    "tracker moved by 2 mm half-way": list(COMMANDS)[1::2],
 }
-"""Commands by mistake: all for a setup fault, mixed rows and a scale; half of them each for two wrong units."""
+"""Commands by mistake: each of them for a scale that siblings could judge apart, a setup fault, and mixed rows."""
 ALIKE = {
     "mm named m",
     "feet named mm",
