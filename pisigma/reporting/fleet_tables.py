@@ -23,7 +23,7 @@ def state_table(status: FleetStatus) -> Table:
 
 
 def cell_table(cells: Iterable[CellStatus]) -> Table:
-    """Return a table of cells: model in use, last session, error and state."""
+    """Return a table of cells: model in use, last session that is not set aside, error and state."""
     return Table(
         ("cell", "model in use", "last session", "RMS [mm]", "found by", "state"),
         tuple(_row(one) for one in cells),
@@ -31,7 +31,8 @@ def cell_table(cells: Iterable[CellStatus]) -> Table:
 
 
 def _row(one: CellStatus) -> tuple[str, ...]:
-    model, sessions, found = one.facts.in_use, one.facts.sessions, one.last_error
+    model, found = one.facts.in_use, one.last_error
+    sessions = [session for session in one.facts.sessions if not session.set_aside]
     error = ("", "") if found is None else (f"{found.rms_mm:.3f}", found.command)
     return (
         one.name,
