@@ -58,7 +58,7 @@ class JointZeros:
     """Shifts of all joint zeros in a session, estimated together, for charts over many sessions.
 
     Attributes:
-        shift: shifts [rad or m].
+        shift: changes of theta or d of the joints [rad or m], without the directions of the joints.
         sigma: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
         model_sensitivity: derivatives of the shifts with respect to the directions of the model's uncertainty, which
             all sessions share.

@@ -15,6 +15,7 @@ from pisigma.lifetime.monitoring.charts import Chart, Series, SeriesChange, inno
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
+from pisigma.robot.row import Row
 
 _DAYS_PER_MONTH = 365.25 / 12
 """Mean length of a month [days]."""
@@ -143,23 +144,21 @@ class Forecast:
         )
 
 
-def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Chart, ...]:
+def charts_of(joints: Sequence[Row], records: Sequence[Record]) -> tuple[Chart, ...]:
     """Return control charts of all joint zeros and of the error.
 
     Args:
-        revolute: whether each joint of the robot is revolute.
+        joints: joints of the robot; their zeros count in the positive direction of the joint.
         records: sessions sorted by date.
     """
-    count = len(revolute) + 1
+    count = len(joints) + 1
     charts = []
-    for joint in range(len(revolute)):
-        values, covariance = _joint_values(records, joint)
-        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+    for number, joint in enumerate(joints, 1):
+        values, covariance = _joint_values(records, number - 1, joint.direction)
+        unit, factor = SHOWN_UNITS["rad" if joint.type == "revolute" else "m"]
         scores = innovations(values, covariance)
         deviations = covariance.diagonal().sqrt() * factor
-        charts.append(
-            Chart(f"joint {joint + 1}", unit, values * factor, deviations, scores, limits_of(count))
-        )
+        charts.append(Chart(f"joint {number}", unit, values * factor, deviations, scores, limits_of(count)))
     rms, scores, spread = (
         torch.tensor([of(one) for one in records], dtype=torch.float64)
         for of in (lambda one: one.session.rms * 1e3, _error_score, _log_spread)
@@ -168,46 +167,46 @@ def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Char
     return tuple(charts)
 
 
-def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Trend, ...]:
+def trends_of(joints: Sequence[Row], records: Sequence[Record]) -> tuple[Trend, ...]:
     """Estimate the drift of joint zeros with time, and with temperature if the sessions state it.
 
     Jumps and single deviating sessions are fitted together with the drift.
 
     Args:
-        revolute: whether each joint of the robot is revolute.
+        joints: joints of the robot; their zeros count in the positive direction of the joint.
         records: sessions sorted by date.
     """
     if len(torch.unique(months_of(records))) < _MIN_SESSIONS:
         return ()
     overs, trends = _overs(records), list[Trend]()
-    for joint in range(len(revolute)):
-        zero = _Zero.from_records(records, joint, overs)
+    for number, joint in enumerate(joints, 1):
+        zero = _Zero.from_records(records, number - 1, joint.direction, overs)
         if zero is None or len(zero.sessions) <= zero.columns.shape[1] + len(zero.events):
             continue
-        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+        unit, factor = SHOWN_UNITS["rad" if joint.type == "revolute" else "m"]
         slopes, deviations = zero.fit(drifts=True)
         trends += [
-            Trend(f"joint {joint + 1}", over, unit, slope * factor, deviation * factor)
+            Trend(f"joint {number}", over, unit, slope * factor, deviation * factor)
             for (over, _), slope, deviation in zip(overs, slopes[1:], deviations[1:], strict=False)
         ]
     return tuple(trends)
 
 
-def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump, ...]:
+def jumps_of(joints: Sequence[Row], records: Sequence[Record]) -> tuple[Jump, ...]:
     """Find jumps of joint zeros between sessions, where jumps explain the zeros better than a drift.
 
     Args:
-        revolute: whether each joint of the robot is revolute.
+        joints: joints of the robot; their zeros count in the positive direction of the joint.
         records: sessions sorted by date.
     """
     if len(torch.unique(months_of(records))) < _MIN_SESSIONS:
         return ()
     overs, jumps = _overs(records), list[Jump]()
-    for joint in range(len(revolute)):
-        zero = _Zero.from_records(records, joint, overs)
+    for number, joint in enumerate(joints, 1):
+        zero = _Zero.from_records(records, number - 1, joint.direction, overs)
         if zero is None or not zero.events:
             continue
-        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+        unit, factor = SHOWN_UNITS["rad" if joint.type == "revolute" else "m"]
         sizes, deviations = (those[-len(zero.events) :] for those in zero.fit(zero.drifts))
         for event, size, deviation in sorted(
             zip(zero.events, sizes, deviations, strict=True), key=lambda one: one[0].number
@@ -216,7 +215,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
                 before, after = (
                     records[zero.sessions[number]].date for number in (event.number - 1, event.number)
                 )
-                what, sizes_of = f"joint {joint + 1}", (size * factor, deviation * factor)
+                what, sizes_of = f"joint {number}", (size * factor, deviation * factor)
                 jumps.append(Jump(what, unit, *sizes_of, before, after, event.is_single))
     return tuple(jumps)
 
@@ -252,10 +251,10 @@ class _Zero:
 
     @staticmethod
     def from_records(
-        records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]
+        records: Sequence[Record], joint: int, direction: int, overs: Sequence[tuple[str, Tensor]]
     ) -> "_Zero | None":
         """Find the changes of a joint zero; None if too few sessions determine it."""
-        values, covariance = _joint_values(records, joint)
+        values, covariance = _joint_values(records, joint, direction)
         there = torch.isfinite(values).nonzero()[:, 0]
         if len(there) < _MIN_SESSIONS + len(overs) - 1:
             return None
@@ -308,15 +307,19 @@ def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:
     return (torch.tensor(days, dtype=torch.float64) - days[0]) / _DAYS_PER_MONTH
 
 
-def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor]:
+def _joint_values(records: Sequence[Record], joint: int, direction: int) -> tuple[Tensor, Tensor]:
     """Return the shifts of a joint zero in all sessions [rad or m], NaN where unobservable, and their covariance.
+
+    Records contain changes of theta or d, which increase against a joint with the direction -1.
 
     The shifts are correlated, because all sessions share the uncertainty of the model.
     """
     values = [float(one.zeros.shift[joint]) if one.session.observable[joint] else math.nan for one in records]
     sensitivity = torch.stack([one.zeros.model_sensitivity[joint] for one in records])
     variance = torch.stack([one.zeros.session_covariance[joint, joint] for one in records])
-    return torch.tensor(values, dtype=torch.float64), sensitivity @ sensitivity.t() + variance.diag()
+    return direction * torch.tensor(
+        values, dtype=torch.float64
+    ), sensitivity @ sensitivity.t() + variance.diag()
 
 
 def _error_score(record: Record) -> float:
