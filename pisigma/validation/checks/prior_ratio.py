@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from pisigma.calibration.geometric.parameter_table import PriorRatio
+from pisigma.calibration.geometric.problem.parameters import zero_directions
 from pisigma.calibration.geometric.problem.prior_scales import PriorGroup
 from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
 from pisigma.validation.checks.check import CheckedCalibration
@@ -148,16 +149,18 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         return
     usual = checked.robot_class
     far = usual.max_sizes.joint_offset if usual is SERVO else FAR
+    directions = zero_directions(checked.robot)
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
         if joint == one.name or not one.free or abs(one.change) - _CERTAIN * one.standard_error < far:
             continue
+        change = math.degrees(one.change) * directions.get(one.name, 1)
         yield Diagnostic(
             kind="joint_zero",
             severity="warning",
-            sentence=f"The zero of joint {joint} is estimated {math.degrees(one.change):.3g} deg away from its nominal "
+            sentence=f"The zero of joint {joint} is estimated {change:.3g} deg away from its nominal "
             f"value (standard error {math.degrees(one.standard_error):.2g} deg), more than is usual for "
             f"robots; check the zero of joint {joint} and how its values were logged (the calibration is valid "
             "for joint values that are logged in the same way).",
-            values={"joint": joint, "change_deg": math.degrees(one.change)},
+            values={"joint": joint, "change_deg": change},
         )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.parameters import row_labels
+from pisigma.calibration.geometric.problem.parameters import zero_directions
 from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
@@ -71,7 +71,7 @@ class JointZero:
 
     Attributes:
         joint: name of the joint.
-        zero_shift: calibrated minus nominal zero [deg].
+        zero_shift: calibrated minus nominal zero, in the direction of the joint [deg].
         standard_error: its standard error [deg]; None if the rows do not determine it.
     """
 
@@ -225,10 +225,10 @@ def _zeros(model: CalibratedModel) -> tuple[JointZero, ...]:
     if summary is None:
         return ()
     figures, robot = {one.name: one for one in summary.parameters}, model.robot
-    zeros, labels = [], row_labels(robot)
-    for joint, row in zip(robot.joints, robot.joint_rows, strict=True):
-        one = figures.get(f"theta_{labels[row]}")
+    zeros = []
+    for joint, (name, direction) in zip(robot.joints, zero_directions(robot).items(), strict=True):
+        one = figures.get(name)
         if joint.type == "revolute" and one is not None and one.change is not None:
             known = None if "prior" in one.label else one.standard_error
-            zeros.append(JointZero(joint.name, one.change, known))
+            zeros.append(JointZero(joint.name, direction * one.change, known))
     return tuple(zeros)

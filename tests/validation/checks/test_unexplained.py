@@ -1,19 +1,26 @@
 """Errors that no calibrated robot has are implausible even if no check explains them; those of healthy arms are not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from testing.checked import checked
+from testing.models import no_type_checker
 from testing.outside_arm import ARMS, OutsideArm
+from testing.report import bare_summary
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.parameters import zero_directions
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.robot.robot_class import HOBBY, SERVO
+from pisigma.robot.robot_class import HOBBY, INDUSTRIAL, SERVO
+from pisigma.validation.checks import prior_ratio
 from pisigma.validation.checks.prior_ratio import check_joint_zero
 from pisigma.validation.checks.unexplained import check_unexplained
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ParameterFigures
+from pisigma.validation.report import arm_in_images
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -44,6 +51,24 @@ def test_healthy_arms_are_plausible(name, rows):
     arm = OutsideArm(name, 6, rows)
     check = checked(GeometricCalibrator(arm.robot), arm.measured())
     assert [*check_unexplained(check), *check_joint_zero(check)] == []
+
+
+def test_errors_of_zeros_count_in_the_direction_of_the_joint(monkeypatch):
+    robot = Robot.load("fanuc_r2000")
+    assert zero_directions(robot) == {f"theta_{k}": 1 if k < 3 else -1 for k in range(1, 7)}
+    theta = SimpleNamespace(name="theta_3", free=True, change=np.deg2rad(2.0), standard_error=1e-4)
+    found = SimpleNamespace(
+        robot=robot, rows=None, robot_class=INDUSTRIAL, geometric=SimpleNamespace(parameters=[theta])
+    )
+    monkeypatch.setattr(prior_ratio, "setup_diagnostics", lambda *_: ())
+    figures = ParameterFigures(
+        name="theta_3", unit="deg", nominal=0, estimated=2, change=2, standard_error=0.01, remark="", label=""
+    )
+    summary = bare_summary(parameters=(figures,))
+    monkeypatch.setattr(CalibrationSummary, "read", lambda _: summary)
+    with no_type_checker():
+        assert next(check_joint_zero(found)).values["change_deg"] == pytest.approx(-2.0)
+        assert [one.zero_shift for one in arm_in_images._zeros(SimpleNamespace(robot=robot))] == [-2.0]
 
 
 @pytest.mark.parametrize(("degrees", "joints"), [(0.0, []), (1.0, [2]), (-1.0, [2])])

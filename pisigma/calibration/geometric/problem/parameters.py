@@ -296,5 +296,16 @@ def row_labels(robot: Robot) -> tuple[str, ...]:
     return tuple(labels)
 
 
+def zero_directions(robot: Robot) -> dict[str, int]:
+    """Return the direction of every joint by the name of the parameter that is its zero, such as "theta_2".
+
+    The zero of a joint with the direction -1 moves against the joint if the parameter increases.
+    """
+    columns = ("theta" if joint.type == "revolute" else "d" for joint in robot.joints)
+    return {
+        f"{column}_{number}": int(robot.directions[number - 1]) for number, column in enumerate(columns, 1)
+    }
+
+
 def _parameter(column: str, name: str, group: str, owner: str) -> Parameter:
     return Parameter(name, group, "m" if column in LENGTHS else "rad", owner)
