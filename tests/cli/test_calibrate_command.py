@@ -70,6 +70,8 @@ def calibrated(run, data, tmp_path_factory):
         3,
         "--set",
         "class=hobby",
+        "--set",
+        "repeats=2",
         "--json",
     )
     assert result.exit_code == 0, result.output
@@ -90,10 +92,10 @@ def test_json_has_the_agreed_shape(calibrated):
     assert (validation["folds"], validation["rows"]) == (3, 60)
     assert set(validation["nominal"]) == set(validation["geometric"]) == POSE
     assert validation["geometric"]["rms_mm"] < validation["nominal"]["rms_mm"] / 3
-    assert validation["repeats"] == 3  # 200 held-out poses at most
+    assert validation["repeats"] == 2
     for name, rms in validation["rms_mm_of_repeats"].items():
         assert_close(np.sqrt(np.square(rms).mean()), validation[name]["rms_mm"], rtol=1e-12)
-        assert len(set(rms)) == 3
+        assert len(set(rms)) == 2
     assert "test" not in printed
 
 
@@ -116,10 +118,11 @@ def test_the_card_states_all_results(calibrated):
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
     assert (
-        "`pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --set class=hobby`" in card
+        "`pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --set class=hobby --set repeats=2`"
+        in card
     )
     assert "60 rows of `poses.csv`" in card
-    assert "3-fold cross-validation, 3 repeats: each of 60 rows" in card
+    assert "3-fold cross-validation, 2 repeats: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
     for row in printed["parameters"]:
         assert f"| {row['name']} | {row['unit']} |" in card

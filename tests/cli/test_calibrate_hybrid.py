@@ -116,24 +116,13 @@ def test_people_read_the_verdict_and_what_was_tried_on_demand(capsys, calibrated
 
 def test_fewer_training_rows(run, refuses, data, tmp_path):
     command = ("calibrate", "rb5", data, "--out")
-    few, many = (
-        json.loads(
-            run(
-                *command,
-                tmp_path / str(rows),
-                "--set",
-                "hold_out=0.3",
-                "--set",
-                f"train_rows={rows}",
-                "--json",
-            ).stdout
-        )
-        for rows in (50, 130)
+    few = json.loads(
+        run(*command, tmp_path / "50", "--set", "hold_out=0.3", "--set", "train_rows=50", "--json").stdout
     )
-    assert (few["rows"], many["rows"]) == (50, 130)
-    assert few["cross_validation"]["rows"] == many["cross_validation"]["rows"] == 60
-    errors = [printed["cross_validation"]["hybrid"]["rms_mm"] for printed in (few, many)]
-    assert errors[1] < errors[0] < 1.05 * few["cross_validation"]["geometric"]["rms_mm"]
+    assert few["rows"] == 50
+    figures = few["cross_validation"]
+    assert figures["rows"] == 60
+    assert figures["hybrid"]["rms_mm"] < 1.05 * figures["geometric"]["rms_mm"]
     assert "--set train_rows=50" in (tmp_path / "50" / "README.md").read_text()
     assert "50 rows of" in (tmp_path / "50" / "README.md").read_text()
     for count in (150, 0):
@@ -227,7 +216,7 @@ def trained_hybrid(run, repository, tmp_path_factory):
     ):
         assert old in text
         text = text.replace(old, new)
-    (folder / "small.yaml").write_text(text + "hybrid: {harmonics: [4, 8], products: false}\n")
+    (folder / "small.yaml").write_text(text + "hybrid: {harmonics: [8], products: false}\n")
     result = run("train", folder / "small.yaml", "--out", folder / "model", "--json")
     assert result.exit_code == 0, result.output
     return folder, json.loads(result.stdout)

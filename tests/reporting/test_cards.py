@@ -62,7 +62,7 @@ def test_provenance_is_complete(card):
 def test_the_figures_of_a_calibration_are_drawn(tmp_path):
     arm = simulate("ur5", rows=40, noise=5e-5)
     with no_type_checker():
-        calibrate("ur5", arm.measurements, CalibrationSettings(model="geometric", folds=2)).save(
+        calibrate("ur5", arm.measurements, CalibrationSettings(model="geometric", folds=2, repeats=1)).save(
             tmp_path / "arm"
         )
     for name in (CORRELATION_PNG, RESIDUALS_PNG, HELD_OUT_PNG):

@@ -14,6 +14,7 @@ from testing.stored import stored
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.measurement import splits
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
@@ -29,7 +30,7 @@ NOISE = 3e-5
 
 @contextmanager
 def few_choices() -> Iterator[None]:
-    """Try few features in calibrations that state no harmonics, for tests of other subjects; recipes state them."""
+    """Try few features and cross-validate once where neither harmonics nor repeats are stated, for other tests."""
     whole, default = HybridCalibrator.__init__, HybridCalibrator.features
     few = {"features": ("gravity", "series"), "harmonics": (4, 8), "products": False}
 
@@ -40,6 +41,7 @@ def few_choices() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HybridCalibrator, "__init__", with_few)
+        patch.setattr(splits, "_MAX_REPEATS", 1)
         yield
 
 

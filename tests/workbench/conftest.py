@@ -2,11 +2,19 @@
 
 import pytest
 from testing.cell_rows import day, measured
+from testing.hybrid import few_choices, few_robots
 from testing.models import no_type_checker
 from testing.pages import visitor
 from testing.report import HOSTILE
 
 from pisigma.workflow.cell.cell import Cell
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Steps that pages start try few features and robots."""
+    with few_choices(), few_robots():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from testing.aged import original_model, rows_after_change
 from testing.cell_models import cell_of_two_models
 from testing.compared import after_collision
+from testing.hybrid import few_choices, few_robots
 from testing.models import no_type_checker
 from testing.report import folder_with_held_out, hybrid_under_test
 
@@ -37,7 +38,7 @@ DAYS = {"2026-01-10": 9, "2026-02-10": 8, "2026-03-10": 3}
 def pages(tmp_path_factory):
     """The folder of the pages."""
     folder = tmp_path_factory.mktemp("pages")
-    with no_type_checker():
+    with no_type_checker(), few_choices(), few_robots():
         arm, model = hybrid_under_test()
         content = report_content(folder_with_held_out(arm, model, folder / "arm"), folder / "arm")
         (folder / "report.html").write_text(render_page(content, draw_figures(content)), encoding="utf-8")
