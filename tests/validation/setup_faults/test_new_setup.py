@@ -31,8 +31,7 @@ def two_setups(first: int, wrong: float = 0.0) -> tuple[Robot, Measurements]:
     return arm.nominal, replace(arm.measurements, position=position, line=lines, source="tracker.csv")
 
 
-@pytest.mark.parametrize("first", [15, 30, 45])
-@pytest.mark.parametrize("wrong", [0.0, 0.05])
+@pytest.mark.parametrize(("first", "wrong"), [(15, 0.05), (30, 0.0), (45, 0.05)])
 def test_the_first_row_after_the_instrument_was_moved_is_named(first: int, wrong: float) -> None:
     problem = instrument_moved_error(*two_setups(first, wrong))
     assert problem is not None
