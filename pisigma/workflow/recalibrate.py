@@ -149,11 +149,13 @@ def recalibrate(
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.wrong_row_indices)
+    consistency = _fleet_consistency(parent, rows)
+    if consistency is not None and consistency.class_share > 0:
+        adaptation = adapt(recalibration_problem(parent, consistency.widened(posterior), rows, elsewhere))
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, with_stage(progress, "cross-validation")
     )
-    consistency = _fleet_consistency(parent, rows)
     odd = consistency is not None and consistency.is_inconsistent
     from_scratch = with_stage(progress, "from scratch")
     choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)

@@ -33,6 +33,8 @@ from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot.description import Robot
 
+_CLASS_SHARES = (0.0, *np.geomspace(1e-4, 10.0, 21).tolist())
+"""Multiples of the covariance of the class that are compared."""
 LINEARISATIONS = 2
 """Linearisations at the mean robot."""
 
@@ -236,10 +238,13 @@ class FleetConsistency:
     Attributes:
         probability: probability that a robot of the fleet is at least as far from its mean.
         gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
+        class_share: multiple of the covariance of its class which, added to that of the fleet, makes its rows most
+            probable; a robot unlike the others would otherwise get the small predicted errors of the fleet.
     """
 
     probability: float
     gain: float
+    class_share: float
 
     @staticmethod
     def from_rows(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
@@ -260,8 +265,25 @@ class FleetConsistency:
         evidence = evidence_of(model, mean, rows)
         fleet = Population(mean, root @ root.t(), posterior.space.arm_parameter_count)
         square, count = fleet.squared_distance(evidence)
-        gain = fleet.log_evidence(evidence) - robot_class_population(nominal).log_evidence(evidence)
-        return FleetConsistency(float(chi2.sf(square, count)), gain)
+        usual = robot_class_population(nominal)
+        evidences = [
+            replace(fleet, covariance=fleet.covariance + share * usual.covariance).log_evidence(evidence)
+            for share in _CLASS_SHARES
+        ]
+        gain = evidences[0] - usual.log_evidence(evidence)
+        best = _CLASS_SHARES[int(np.argmax(evidences))]
+        return FleetConsistency(float(chi2.sf(square, count)), gain, best)
+
+    def widened(self, prior: ModelPosterior) -> ModelPosterior:
+        """Return the prior with this multiple of the covariance of the robot's class added."""
+        space, usual = prior.space, robot_class_population(prior.space.robot)
+        deviation = (self.class_share * usual.covariance.diagonal()).sqrt().diag()
+        between = prior.covariance_root.new_zeros(
+            (len(space.parameters) - space.arm_parameter_count, len(deviation))
+        )
+        arm, weights = deviation[: space.arm_parameter_count], deviation[space.arm_parameter_count :]
+        added = torch.cat([arm, between, weights])
+        return replace(prior, covariance_root=torch.cat([prior.covariance_root, added], 1))
 
     @property
     def is_inconsistent(self) -> bool:

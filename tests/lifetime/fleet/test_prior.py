@@ -1,5 +1,7 @@
 """Fleet priors, and what they gain for ten poses of another robot."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.calibration.hybrid.noise import CalibrationNoise
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.population import Population, expectation_maximisation, without_outliers
 from pisigma.files.errors import FleetError
 from pisigma.lifetime.fleet.prior import FleetConsistency, RobotEvidence, fleet_prior
@@ -75,6 +78,11 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
     assert (
         fewer.summary.changed == FleetConsistency.from_rows(prior.model, few.select(torch.arange(8))).sentence
     )
+    # the prior is widened until it contains this robot
+    root = CovarianceRoot(fewer.adaptation.problem.posterior.covariance_root)
+    widened = replace(prior.model, uncertainty=replace(prior.model.uncertainty, covariance_root=root))
+    with no_type_checker():
+        assert not FleetConsistency.from_rows(widened, few.select(torch.arange(8))).is_inconsistent
 
 
 def test_expectation_maximisation_finds_a_population():
