@@ -86,36 +86,69 @@ class MeasuredPoses:
     def squared_errors(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
         """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the squared angle."""
         off = (self.position - T[..., :3, 3]).square().sum(-1)
+        if not bool(self.has_rotation.any()):
+            return off
         turn = (self.rotation - T[..., :3, :3]).square().sum((-2, -1)) / 2
         return off + self.lever**2 * torch.where(self.has_rotation, turn, 0.0)
 
 
 def best_base(
-    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+    T: Float64[Tensor, "*batch rows 4 4"],
+    measured: MeasuredPoses,
+    weight: Float64[Tensor, "*batch rows"] | None = None,
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X that minimises the distance of `X T` from measured poses (orthogonal Procrustes)."""
+    """Find the transform X that minimises the distance of `X T` from measured poses (orthogonal Procrustes).
+
+    Args:
+        T: predicted poses.
+        measured: measured poses.
+        weight: weight of every row; None for equal weights.
+    """
     # The best shift makes the mean positions equal, so only the rotation remains to be found.
-    middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(-2, keepdim=True)
-    M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
+    middle, wanted = _mean(T[..., :3, 3], weight), _mean(measured.position, weight)
+    off = measured.position - wanted
+    M = (off if weight is None else weight[..., None] * off).mT @ (T[..., :3, 3] - middle)
     if bool(measured.has_rotation.any()):
-        weight = measured.has_rotation.to(T)[:, None, None]
         # As in `squared_errors`, every column of a rotation is treated as a point of weight lever² / 2.
-        M = M + measured.lever**2 / 2 * (weight * measured.rotation @ T[..., :3, :3].mT).sum(-3)
+        turned = _rotation_weights(measured, weight) * measured.rotation @ T[..., :3, :3].mT
+        M = M + measured.lever**2 / 2 * turned.sum(-3)
     R = nearest_rotation(M)
     return transform(R, (wanted - middle @ R.mT)[..., 0, :])
 
 
 def best_tool(
-    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+    T: Float64[Tensor, "*batch rows 4 4"],
+    measured: MeasuredPoses,
+    weight: Float64[Tensor, "*batch rows"] | None = None,
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X (a translation without rotations) that minimises the distance of `T X` from poses."""
+    """Find the transform X (a translation without rotations) that minimises the distance of `T X` from poses.
+
+    The arguments are those of `best_base`.
+    """
     R = T[..., :3, :3]
     # `T X` is separable: its position depends only on the tool's translation, its rotation only on the tool's rotation.
-    offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
+    offset = _mean((R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0], weight)[..., 0, :]
     if not bool(measured.has_rotation.any()):
-        return transform(torch.eye(3).to(T), offset)
-    weight = measured.has_rotation.to(T)[:, None, None]
-    return transform(nearest_rotation((weight * R.mT @ measured.rotation).sum(-3)), offset)
+        return transform(torch.eye(3).to(T).expand(*T.shape[:-3], 3, 3), offset)
+    turned = (_rotation_weights(measured, weight) * R.mT @ measured.rotation).sum(-3)
+    return transform(nearest_rotation(turned), offset)
+
+
+def _mean(
+    values: Float64[Tensor, "*#batch rows 3"], weight: Float64[Tensor, "*#batch rows"] | None
+) -> Float64[Tensor, "*#batch 1 3"]:
+    """Return the weighted mean over the rows."""
+    if weight is None:
+        return values.mean(-2, keepdim=True)
+    return (weight / weight.sum(-1, keepdim=True))[..., None, :] @ values
+
+
+def _rotation_weights(
+    measured: MeasuredPoses, weight: Float64[Tensor, "*batch rows"] | None
+) -> Float64[Tensor, "*#batch rows 1 1"]:
+    """Return the weight of every row's rotation, which is 0 where none was measured."""
+    there = measured.has_rotation.to(measured.position)
+    return (there if weight is None else weight * there)[..., None, None]
 
 
 def affine_error(
@@ -141,6 +174,16 @@ def affine_error(
     K = _rotation_products(T, measured) / measured.has_rotation.sum()
     turns: Tensor = 3 * (1 - torch.linalg.matrix_norm(K, 2)).clamp(min=0.0)
     return error + measured.lever**2 * turns
+
+
+def smallest_error(
+    T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*#batch"]:
+    """Return a lower bound of the RMS error [m] with any base and tool; 0 for too few rows for `affine_error`."""
+    rows = T.shape[-3]
+    if rows <= AFFINE_UNKNOWNS:
+        return torch.zeros_like(T[..., 0, 0, 0])
+    return (affine_error(T, measured) * (1 - AFFINE_UNKNOWNS / rows)).sqrt()
 
 
 def best_base_and_tool(
@@ -182,7 +225,8 @@ def moved_base_and_tool(
     step: Float64[Tensor, "*batch 12"],
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
     """Return base and tool moved by a step as returned by `base_and_tool_step`."""
-    return moved_frame(base, step[..., :6]), moved_frame(tool, step[..., 6:])
+    base, tool = moved_frame(torch.stack([base, tool], -3), step.reshape(*step.shape[:-1], 2, 6)).unbind(-3)
+    return base, tool
 
 
 def moved_frame(
@@ -270,8 +314,9 @@ def frame_jacobian(
     R_base, R_flange = base[..., :3, :3], base[..., :3, :3] @ T[..., :3, :3]
     arm = (R_base @ (T[..., :3, 3:] + T[..., :3, :3] @ tool[..., :3, 3:]))[..., 0]
     eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
-    weight = measured.lever * measured.has_rotation.to(T)[..., None]
-    turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
+    weight, turn = measured.lever * measured.has_rotation.to(T)[..., None], torch.zeros_like(arm)
+    if bool(measured.has_rotation.any()):
+        turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
     # The tool rotates about its origin, in the axes of the flange, which does not move the position.
     J = torch.cat([eye, -skew(arm), R_flange, none], -1)
     J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)

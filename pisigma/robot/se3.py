@@ -140,15 +140,17 @@ def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the matrix of the cross product with a vector: `skew(a) @ b = a × b`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
-    return torch.stack(rows, -2)
+    entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return entries.view(*vector.shape[:-1], 3, 3)
 
 
 def transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Return the homogeneous transform of a rotation and a translation [m]; both broadcast."""
-    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    batch = rotation.shape[:-2]
+    if batch != translation.shape[:-1]:
+        batch = torch.Size(np.broadcast_shapes(batch, translation.shape[:-1]))
     upper = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
     last_row = torch.eye(4, dtype=upper.dtype, device=upper.device)[3:].expand(*batch, 1, 4)
     return torch.cat([upper, last_row], -2)

@@ -5,7 +5,13 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.frame_fits import MeasuredPoses, best_base, best_base_and_tool, best_tool
+from pisigma.robot.frame_fits import (
+    MeasuredPoses,
+    best_base,
+    best_base_and_tool,
+    best_tool,
+    smallest_error,
+)
 from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
 
 BASE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
@@ -54,6 +60,27 @@ def test_perturbed_transforms_fit_worse(T, generator, turned):
                 continue  # a turn of the tool shows in no position
             near = X @ transform(rotation_from_vector(step[3:]), step[:3])
             assert float(rows.squared_errors(T @ near if behind else near @ T).sum()) > float(least)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_weights_select_rows(T, generator, turned):
+    spoilt = BASE @ T @ TOOL
+    spoilt[:, :3, 3] += 0.05 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    rows, chosen = measured_as(spoilt, turned), torch.rand(5, 40, generator=generator) < 0.4
+    for fit in (best_base, best_tool):
+        weighted = fit(T.expand(5, 40, 4, 4), rows, chosen.double())
+        assert_close(weighted, torch.stack([fit(T[some], rows.select(some)) for some in chosen]), atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_no_base_and_tool_leave_smaller_errors(T, generator, turned):
+    spoilt = BASE @ T @ TOOL
+    spoilt[:, :3, 3] += 0.05 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    rows = measured_as(spoilt, turned)
+    base, tool = best_base_and_tool(T, rows)
+    fitted = float(rows.squared_errors(base @ T @ tool).mean().sqrt())
+    assert 0.5 * fitted < float(smallest_error(T, rows)) < fitted
+    assert float(smallest_error(T[:13], rows.select(torch.arange(13)))) == 0.0
 
 
 def test_batches_equal_single_ones(T):
