@@ -9,6 +9,8 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import MeasuredPoses, smallest_error
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
@@ -39,7 +41,7 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     others = {
         name: size
         for name, other in robots.items()
-        if (size := _rms_mm(checked, other)) is not None and size <= _SUSPICIOUS * other.reach * 1e3
+        if (size := _rms_mm(checked, other, _SUSPICIOUS * other.reach)) is not None
     }
     name = min(others, key=lambda other: others[other], default=None)
     if name is not None and others[name] < _NEARER * stated:
@@ -73,15 +75,24 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
     return tuple(check_other_robot(checked))
 
 
-def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
-    """Return the RMS error of another nominal robot [mm]; None if its joints differ or it cannot be fitted."""
+def _rms_mm(checked: CheckedCalibration, other: Robot, limit: float) -> float | None:
+    """Return the RMS error of another nominal robot [mm].
+
+    It is None if the joints differ, or if base and tool cannot be fitted with an error of at most `limit` [m].
+    """
     if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
         return None
     count = checked.rows.rows
     chosen = torch.linspace(0, count - 1, min(count, _MAX_ROWS)).round().long()
     rows = checked.rows.select(chosen)
+    one_setup = len(set(rows.frame)) == len(set(rows.target)) == 1
+    if one_setup and rows.position is not None and bool(torch.isfinite(rows.position).all()):
+        measured = MeasuredPoses.from_tensors(rows.position, None, 0.0)
+        if smallest_error(forward_kinematics(other, rows.q), measured) > limit:
+            return None
     try:
         fitted = base_and_tool_calibrator(replace(checked.calibrator, robot=other)).fit(rows)
     except IdentificationError:
         return None
-    return pose_errors_of(fitted, rows).figures.rms_mm
+    size = pose_errors_of(fitted, rows).figures.rms_mm
+    return size if size is not None and size <= limit * 1e3 else None

@@ -1,5 +1,6 @@
 """Check whether a fault of the setup or the file explains errors that are too large for the nominal robot."""
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool
+from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool, smallest_error
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
@@ -114,25 +115,33 @@ def check_joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic
     group = largest_group(rows)
     if not _MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
         return
-    here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
+    here, usual = _errors(robot, group, group.q[None], math.inf)[0], usual_error(robot, group.q)
     if not here > usual:
         return
-    maps = signs_and_swaps(robot.dof)
+    maps, limit = signs_and_swaps(robot.dof), min(usual, COLLAPSED * here)
     found = [
         (left, joint_causes(maps, number, robot)[0])
-        for number, left in enumerate(_errors(robot, group, maps.apply(group.q)))
-        if left <= min(usual, COLLAPSED * here)
+        for number, left in enumerate(_errors(robot, group, maps.apply(group.q), limit))
+        if left <= limit
     ]
     if found:
         left, cause = min(found, key=lambda one: one[0])
         yield fault_of_cause(cause, here, left).diagnostic()
 
 
-def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
-    """Compute RMS position errors [m] with base and tool fitted, corrected for the degrees of freedom."""
+def _errors(
+    robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"], limit: float
+) -> list[float]:
+    """Compute RMS position errors [m] with base and tool fitted, corrected for the degrees of freedom.
+
+    They are infinite where they are certainly larger than the limit [m].
+    """
     measured = MeasuredPoses.from_tensors(rows.position, None, 0.0)
     errors = []
     for T in forward_kinematics(robot, q):
+        if smallest_error(T, measured) > limit:
+            errors.append(math.inf)
+            continue
         base, tool = best_base_and_tool(T, measured)
         square = measured.squared_errors(base @ T @ tool).mean()
         errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED_PARAMETERS)).sqrt()))
