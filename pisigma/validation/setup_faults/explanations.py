@@ -22,13 +22,12 @@ from pisigma.model.calibrated_model import (
 )
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import (
-    AFFINE_UNKNOWNS,
     LEVER_SHARE,
     MeasuredPoses,
-    affine_error,
     best_base,
     best_base_and_tool,
     best_tool,
+    smallest_error,
 )
 from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import rotation_vector
@@ -87,7 +86,7 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], max_error: float) ->
     explaining = [
         other
         for other in fault_hypotheses
-        if other.error <= min(max_error, COLLAPSED * other.measured.spread)
+        if other.error <= max_error and other.error <= COLLAPSED * other.measured.spread
     ]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
@@ -118,10 +117,12 @@ def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) 
     for measured, cause in _likely_conventions(arm, here):
         yield replace(here, measured=measured, causes=(cause,))
     maps = likely_maps(arm, some, here.measured)
-    for number, q in enumerate(maps.apply(some.q)):
-        T = arm.poses(replace(some, q=q))
-        if bool(torch.isfinite(T).all()):
-            yield Hypothesis(q, T, here.measured, joint_causes(maps, number, arm.robot), 1)
+    if len(maps.matrix) == 0:
+        return
+    q = maps.apply(some.q)
+    T = arm.poses_at(q, some)
+    for number in torch.isfinite(T).flatten(1).all(1).nonzero()[:, 0].tolist():
+        yield Hypothesis(q[number], T[number], here.measured, joint_causes(maps, number, arm.robot), 1)
 
 
 def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[MeasuredPoses, Cause]]:
@@ -166,7 +167,8 @@ def frame_hypotheses(
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses unchanged, with another frame, tool, and both; without a model, both are always fitted.
 
-    Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `max_error` [m].
+    Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `max_error` [m]. With a
+    model, other frames and tools that leave more are left out.
 
     Args:
         arm: the predicting arm.
@@ -184,14 +186,21 @@ def frame_hypotheses(
         bases_of_rows(arm.model, rows),
     )
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
+
+    def moved(here: Hypothesis, T: Tensor, fitted_parameters: int, **motions: Tensor) -> Iterator[Hypothesis]:
+        other = replace(here, T=T, fitted_parameters=here.fitted_parameters + fitted_parameters)
+        if other.error <= max_error:
+            causes = [_moved(kind, X, bases if kind == "frame" else None) for kind, X in motions.items()]
+            yield replace(other, causes=(*here.causes, *causes))
+
     for here in hypotheses:
         yield here
         X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
-        yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
-        yield here.with_cause(_moved("tool", Y), here.T @ Y, here.values_of_tool * tools)
+        yield from moved(here, X @ here.T, 6 * count, frame=X)
+        yield from moved(here, here.T @ Y, here.values_of_tool * tools, tool=Y)
     for here, base, tool in _with_frames_fitted(hypotheses, max_error) if count == tools == 1 else ():
-        moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
-        yield moved.with_cause(_moved("tool", tool[None]), moved.T @ tool, here.values_of_tool)
+        fitted = 6 + here.values_of_tool
+        yield from moved(here, base @ here.T @ tool, fitted, frame=base[None], tool=tool[None])
 
 
 def _with_frames_fitted(
@@ -201,15 +210,14 @@ def _with_frames_fitted(
     groups: dict[tuple[bool, ...], list[Hypothesis]] = {}
     for here in tried:
         groups.setdefault(tuple(here.measured.has_rotation.tolist()), []).append(here)
-    for rows, group in groups.items():
+    for group in groups.values():
         T, measured = (
             torch.stack([here.T for here in group]),
             MeasuredPoses.stack([h.measured for h in group]),
         )
-        if len(rows) > AFFINE_UNKNOWNS:
-            likely = ~(affine_error(T, measured) * (1 - AFFINE_UNKNOWNS / len(rows)) > most**2)
-            group = list(itertools.compress(group, likely.tolist()))
-            T, measured = T[likely], measured.select_batches(likely)
+        likely = ~(smallest_error(T, measured) > most)
+        group = list(itertools.compress(group, likely.tolist()))
+        T, measured = T[likely], measured.select_batches(likely)
         yield from zip(group, *best_base_and_tool(T, measured), strict=True)
 
 

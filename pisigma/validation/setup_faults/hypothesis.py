@@ -31,7 +31,8 @@ COLLAPSED = 0.25
 """Largest share of the errors that may remain if a setup fault explains them."""
 _MIN_FREEDOM = 6
 """Smallest number of degrees of freedom that must remain after a fit."""
-_MAX_POSES = 2**17
+_MAX_POSES = 2**13
+"""Number of poses that are compared together, so that the arrays stay in the processor's cache."""
 FittedFrames = Literal["none", "base", "base and tool"]
 """Frames that are fitted to the rows under a hypothesis."""
 _SHIFTS = (1, -1, 2, -2)
@@ -70,6 +71,13 @@ class PredictingArm:
         if self.model is not None:
             return poses_of_rows(self.model, rows)
         return forward_kinematics(self.robot, rows.q)
+
+    def poses_at(
+        self, q: Float64[Tensor, "maps rows dof"], rows: Measurements
+    ) -> Float64[Tensor, "maps rows 4 4"]:
+        """Predict the poses of rows at other joint values [rad or m]."""
+        repeated = rows.select(torch.arange(rows.rows).repeat(len(q)))
+        return self.poses(replace(repeated, q=q.flatten(0, 1))).reshape(*q.shape[:2], 4, 4)
 
     @property
     def fits_of_frames(self) -> tuple[FittedFrames, ...]:
