@@ -128,15 +128,15 @@ def joint_unit_maps(robot: Robot) -> JointMaps:
     return JointMaps.scaled(torch.tensor(rows, dtype=torch.float64).reshape(len(rows), robot.dof))
 
 
-def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
+def quarter_turned_zeros(robot: Robot, fitted: FittedFrames = "none") -> JointMaps:
     """Return maps with zeros moved by multiples of 90 deg, one joint at a time if there are too many combinations.
 
     Args:
         robot: the robot.
-        inner: whether to omit the first and the last joint, whose zeros are absorbed by a fitted base and tool.
+        fitted: fitted frames; a base absorbs the zero of the first joint, and a tool that of the last joint.
     """
-    turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
-    turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
+    absorbed = {"none": (), "base": (0,), "base and tool": (0, robot.dof - 1)}[fitted]
+    turning = [i for i, revolute in enumerate(robot.revolute) if revolute and i not in absorbed]
     if 4 ** len(turning) <= _MAX_ZEROS:
         choices = np.array(list(itertools.product((0, 1, 2, -1), repeat=len(turning)))[1:])
     else:
@@ -260,7 +260,6 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
         reversed_signs(robot.dof),
         joint_order_maps(robot.dof),
         coupled_joints(robot.dof),
-        quarter_turned_zeros(robot, inner=arm.model is None),
     )
     tried = [(maps, errors_of(maps)) for maps in kinds]
     unchanged = errors_of(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()
@@ -268,7 +267,9 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     for number, mode in enumerate(arm.fits_of_frames):
         zeros = _best_zeros(robot, lambda maps, mode=mode: errors_of(maps, [mode])[0])  # type: ignore[misc]
         candidates = [(maps, errors[number]) for maps, errors in tried]
-        candidates.append((zeros, errors_of(zeros, [mode])[0]))
+        candidates += [
+            (maps, errors_of(maps, [mode])[0]) for maps in (quarter_turned_zeros(robot, mode), zeros)
+        ]
         least = min(float(errors.min()) for _, errors in candidates if len(errors))
         limit = min(_PROMISING**2 * unchanged[number], max(NEAR_BEST**2 * least, NOTICED**2))
         for maps, errors in candidates:

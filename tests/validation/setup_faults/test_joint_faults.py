@@ -39,6 +39,8 @@ def test_every_fault_appears_once_and_changes_something():
         "units": (joint_unit_maps(arm), 2 * (2**6 - 1) + 2),
         "units with a sliding joint": (joint_unit_maps(scara), 2 * (2**3 - 1) + 2 + 2),
         "zeros": (quarter_turned_zeros(arm), 4**6 - 1),
+        "zeros that a base does not absorb": (quarter_turned_zeros(arm, "base"), 4**5 - 1),
+        "zeros that base and tool do not absorb": (quarter_turned_zeros(arm, "base and tool"), 4**4 - 1),
     }
     for name, (maps, count) in counts.items():
         rows = torch.cat([maps.matrix.flatten(1), maps.offset], 1)
