@@ -164,20 +164,12 @@ class RowsUnderModel:
         self, zero_shifts: Float64[Tensor, " dof"] | None = None
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
         """Return poses predicted with moved joint zeros [rad or m], and their derivatives from finite differences."""
-        zero_shifts = (
-            torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zero_shifts is None else zero_shifts
-        )
-        moved = [zero_shifts, *(zero_shifts + _STEP * torch.eye(self.renamed_rows.dof).double())]
-        here, *there = (
-            poses_of_rows(
-                self.model,
-                Measurements(
-                    self.renamed_rows.q + by, frame=self.renamed_rows.frame, target=self.renamed_rows.target
-                ),
-            )
-            for by in moved
-        )
-        return here, torch.stack([(one - here) / _STEP for one in there])
+        rows = self.renamed_rows
+        by = _STEP * torch.cat([torch.zeros(1, rows.dof), torch.eye(rows.dof)]).double()
+        q = rows.q + (by if zero_shifts is None else zero_shifts + by)[:, None]
+        moved = Measurements(q.flatten(0, 1), frame=rows.frame * len(q), target=rows.target * len(q))
+        T = poses_of_rows(self.model, moved).reshape(*q.shape[:2], 4, 4)
+        return T[0], (T[1:] - T[0]) / _STEP
 
     @cached_property
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
@@ -200,9 +192,9 @@ class RowsUnderModel:
         """Lengths of the position errors [m]."""
         return self.error_lengths(self.predicted)
 
-    def error_lengths(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
+    def error_lengths(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
         """Compute the lengths of the position errors of predicted poses [m]."""
-        result: Tensor = (self.measured.position - T[:, :3, 3]).norm(dim=-1)
+        result: Tensor = (self.measured.position - T[..., :3, 3]).norm(dim=-1)
         return result
 
     @cached_property

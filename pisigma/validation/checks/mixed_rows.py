@@ -1,6 +1,5 @@
 """Check whether only some of the rows agree with a model while the others belong to another setup."""
 
-import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -41,9 +40,11 @@ _FAR_APART = 6.0
 """Smallest ratio of the median errors of both groups."""
 _BETWEEN = 0.15
 """Largest share of the rows that may be neither near nor far."""
-DRAWS, _SAMPLE = 100, 4
+DRAWS, _SAMPLE, _REFITS = 100, 4, 2
 """Number and size of the random samples of rows to which a base or a tool is fitted, in addition to halves of the file
-and every second row."""
+and every second row; and number of further fits to the rows that agree."""
+_MAX_POSES = 2**13
+"""Number of poses that are compared together."""
 _SPARE_ROWS = 3
 """Number of rows that must agree with a fit in addition to the rows of its sample."""
 _ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
@@ -59,8 +60,9 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     are mixed, or it is unknown which rows are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to
     all rows first.
     """
-    if not bool(torch.isfinite(judged.predicted_sigma).all()):
-        return
+    limit = AGREES * judged.predicted_sigma
+    if not bool(torch.isfinite(limit).all()) or bool((judged.errors <= limit).all()):
+        return  # unknown limits, or all rows agree with one setup
     found = [one for one in (_apart(judged, T) for T in _agreements(judged)) if one is not None]
     if found and not _joints_explain(judged):
         yield mixed_rows_diagnostic(judged, min(found, key=lambda far: int(far.sum())))
@@ -103,43 +105,41 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
         yield judged.poses_before_fit
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
         return
-    limit = AGREES * judged.predicted_sigma
-    samples = list(_samples(judged.rows.rows))
-
-    @functools.lru_cache(maxsize=16)  # most samples soon lead to the same agreeing rows
-    def fit(kind: str, chosen: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        T = _fitted(judged, kind, torch.tensor(chosen))
-        return T, judged.error_lengths(T) <= limit
-
+    count, limit = judged.rows.rows, AGREES * judged.predicted_sigma
     for kind in ("base", "tool"):
-        best, most = None, _SAMPLE + _SPARE_ROWS - 1
-        for sample in samples:
-            chosen = sample
-            for _ in range(3):  # local optimisation: fit again to all rows that agree
-                T, agreeing = fit(kind, tuple(chosen.tolist()))
-                chosen = agreeing.nonzero()[:, 0]
-                if len(chosen) < _SAMPLE:
-                    break
-            if int(agreeing.sum()) > most:
-                best, most = T, int(agreeing.sum())
-        if best is not None:
-            yield best
+        agreeing = _samples(count)
+        for _ in range(1 + _REFITS):  # local optimisation: fit again to all rows that agree
+            chosen = agreeing[agreeing.sum(1) >= _SAMPLE]
+            # Most samples soon lead to the same agreeing rows.
+            sets, number = torch.unique(chosen, dim=0, return_inverse=True)
+            agreeing = torch.cat(
+                [
+                    judged.error_lengths(_fitted(judged, kind, some)) <= limit
+                    for some in torch.split(sets, max(1, _MAX_POSES // count))
+                ]
+            )[number]
+        most = agreeing.sum(1)
+        if len(most) and int(most.max()) >= _SAMPLE + _SPARE_ROWS:
+            yield _fitted(judged, kind, chosen[most.argmax()][None])[0]
 
 
-def _samples(rows: int) -> Iterator[Tensor]:
-    """Yield halves of the file, every second row, and small random samples."""
+def _samples(rows: int) -> Bool[Tensor, "samples rows"]:
+    """Return masks of the halves of the file, of every second row, and of small random samples."""
     every, draw = torch.arange(rows), torch.Generator().manual_seed(0)
-    yield from (every[: rows // 2], every[rows // 2 :], every[::2], every[1::2])
-    for _ in range(DRAWS):
-        yield torch.randperm(rows, generator=draw)[:_SAMPLE]
+    drawn = [torch.randperm(rows, generator=draw)[:_SAMPLE] for _ in range(DRAWS)]
+    first, even = every < rows // 2, every % 2 == 0
+    halves = torch.stack([first, ~first, even, ~even])
+    return torch.cat([halves, (every == torch.stack(drawn)[..., None]).any(1)])
 
 
-def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
+def _fitted(
+    judged: RowsUnderModel, kind: str, chosen: Bool[Tensor, "samples rows"]
+) -> Float64[Tensor, "samples rows 4 4"]:
     """Return predicted poses, with the base or the tool fitted to the chosen rows."""
-    some, measured = judged.poses_before_fit[chosen], judged.measured.select(chosen)
+    T = judged.poses_before_fit.expand(*chosen.shape, 4, 4)
     if kind == "base":
-        return best_base(some, measured) @ judged.poses_before_fit
-    return judged.poses_before_fit @ best_tool(some, measured)
+        return best_base(T, judged.measured, chosen.double())[:, None] @ T
+    return T @ best_tool(T, judged.measured, chosen.double())[:, None]
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
