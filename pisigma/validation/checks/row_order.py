@@ -1,13 +1,13 @@
 """Check whether the measuring frame or the tool moved while the rows were measured, before and after a calibration."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
-from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool, guess_base_and_tool
 from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE
 from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
@@ -139,7 +139,10 @@ def instrument_moved_error(robot: Robot, measurements: Measurements) -> Identifi
     third = max(len(order) // 3, _MIN_ROWS)
     if len(order) < 2 * _MIN_ROWS + 1:
         return None
-    if float(np.median(_errors(robot, measurements, order))) < _FITS_SHARE * robot.reach:
+    if any(
+        float(np.median(_errors(robot, measurements, order, fit))) < _FITS_SHARE * robot.reach
+        for fit in (_guessed, _fitted)
+    ):
         return None  # one setup explains all rows
     for backwards in (False, True):
         along = order[::-1] if backwards else order
@@ -167,10 +170,26 @@ def instrument_moved_error(robot: Robot, measurements: Measurements) -> Identifi
     return None
 
 
-def _errors(robot: Robot, measurements: Measurements, rows: np.ndarray) -> Float64[np.ndarray, " rows"]:
+def _guessed(robot: Robot, rows: Measurements) -> Robot:
+    """Return the robot with base and tool guessed in closed form."""
+    base, tools = guess_base_and_tool(robot, rows, free_base=True, free_tool=True)
+    return robot.with_geometry(base=base, tool=tools[rows.target[0]])
+
+
+def _fitted(robot: Robot, rows: Measurements) -> Robot:
+    """Return the robot with base and tool fitted."""
+    return fit_base_and_tool(robot, rows).robot
+
+
+def _errors(
+    robot: Robot,
+    measurements: Measurements,
+    rows: np.ndarray,
+    fit: Callable[[Robot, Measurements], Robot] = _fitted,
+) -> Float64[np.ndarray, " rows"]:
     """Compute all position errors [m] with base and tool fitted to the given rows; infinite if undetermined."""
     try:
-        fitted = fit_base_and_tool(robot, measurements.select(torch.from_numpy(rows.copy()))).robot
+        fitted = fit(robot, measurements.select(torch.from_numpy(rows.copy())))
     except IdentificationError:
         return np.full(measurements.rows, np.inf)
     assert measurements.position is not None

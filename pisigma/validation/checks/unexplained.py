@@ -72,31 +72,31 @@ MAX_STEP = 0.3
 def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
     limit = plausible_share(judged.model.robot) * judged.model.robot.reach
-    if judged.has_large_errors and not judged.setup_faults and _left(judged) > limit:
+    if judged.has_large_errors and not judged.setup_faults and not _can_fit(judged, limit):
         yield unexplained_diagnostic(judged.model)
 
 
-def _left(judged: RowsUnderModel) -> float:
-    """Compute the RMS residual after the fit [m], corrected for the degrees of freedom."""
+def _can_fit(judged: RowsUnderModel, limit: float) -> bool:
+    """Return whether the fit leaves an RMS residual of at most `limit` [m], corrected for the degrees of freedom."""
     known, robot = judged.renamed_rows, judged.model.robot
     zeros = torch.zeros(known.dof, dtype=torch.float64)
     largest = (
         MAX_STEP * torch.tensor([1.0 if revolute else robot.reach for revolute in robot.revolute]).double()
     )
     moves = "joint_zero" in judged.allowed_moves
-    least = float("inf")
+    values = 3 * known.rows
+    limit *= math.sqrt(max(values - FITTED_PARAMETERS - (known.dof if moves else 0), 1) / values)
     for _ in range(MAX_ITERATIONS if moves else 1):
         T, derivative = judged.poses_with_moved_zeros(zeros)
         # Base and tool have a closed form for given zeros; a Gauss-Newton step of the zeros follows.
         base, tool = best_base_and_tool(T, judged.measured)
         error = judged.measured.position - (base @ T @ tool)[:, :3, 3]
-        least = min(least, float(error.square().sum(1).mean().sqrt()))
+        if float(error.square().sum(1).mean().sqrt()) <= limit:
+            return True
         J = (base @ derivative @ tool)[..., :3, 3].flatten(1).t()
         step = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
         zeros = zeros + step.clamp(-largest, largest)
-    values = 3 * known.rows
-    spare = max(values - FITTED_PARAMETERS - (known.dof if moves else 0), 1)
-    return least * math.sqrt(values / spare)
+    return False
 
 
 _UNRELATED_SHARE = 0.5

@@ -120,6 +120,8 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
         if bool(judged.measured.has_rotation.any()):
             angles = _angles(judged, T)
             suspicious = suspicious | (angles > _SUSPICIOUS * angles[judged.measured.has_rotation].median())
+        if not bool(suspicious.any()):
+            break
         usual = replace(
             judged.measured,
             position=torch.where(suspicious[:, None], T[:, :3, 3], judged.measured.position),
