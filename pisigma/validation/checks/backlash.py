@@ -79,6 +79,7 @@ def with_sides_of_order(
     calibrator: GeometricCalibrator,
     rows: Measurements,
     select_rows: Callable[[Measurements], Measurements] = lambda rows: rows,
+    result: CalibrationResult | None = None,
 ) -> tuple[Measurements, tuple[Diagnostic, ...]]:
     """State the directions of the last motions in rows without directions of approach, if these matter.
 
@@ -86,6 +87,7 @@ def with_sides_of_order(
         calibrator: a geometric calibrator of the robot.
         rows: all rows of the files, because the last motion follows from the preceding row.
         select_rows: function that selects the rows that decide whether the directions matter.
+        result: calibration with the selected rows; None to calibrate.
 
     Returns:
         The rows, and the finding of `unstated_backlash`; without a finding, the unchanged rows and None.
@@ -93,11 +95,13 @@ def with_sides_of_order(
     if rows.approach is not None:
         return rows, ()
     sided = replace(rows, approach=approach_by_order(rows))
-    found = unstated_backlash(calibrator, select_rows(sided))
+    found = unstated_backlash(calibrator, select_rows(sided), result)
     return (rows, ()) if found is None else (sided, (found,))
 
 
-def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Diagnostic | None:
+def unstated_backlash(
+    calibrator: GeometricCalibrator, rows: Measurements, result: CalibrationResult | None = None
+) -> Diagnostic | None:
     """Test whether the directions of the last motions matter in rows that state no directions of approach.
 
     A lag between joint values and measurements also depends on the last motion; the explanation with the larger
@@ -106,6 +110,7 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
     Args:
         calibrator: a geometric calibrator of the robot.
         rows: the rows, with the directions that follow from their order (`approach_by_order`).
+        result: calibration with the rows without directions; None to calibrate.
 
     Returns:
         A warning that names the joints and their backlash; None if there is none.
@@ -113,7 +118,7 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
     if rows.position is None:
         return None
     try:
-        result = calibrator.fit(replace(rows, approach=None))
+        result = calibrator.fit(replace(rows, approach=None)) if result is None else result
     except IdentificationError:
         return None  # the calibration itself rejects these rows
     ordered = OrderedRows.from_result(result)

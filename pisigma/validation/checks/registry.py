@@ -20,7 +20,7 @@ from pisigma.validation.checks.temperature import check_temperature
 from pisigma.validation.checks.torques import check_torques
 from pisigma.validation.checks.unexplained import check_residual, check_unexplained, check_unexplained_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations
+from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations, geometric_result
 
 _CHECKS: tuple[Check, ...] = (
     check_other_robot,
@@ -70,9 +70,12 @@ def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> 
         ImplausibleError: no calibration error explains the rows.
         IdentificationError: the rows cannot belong to this robot.
     """
-    rows, backlash = with_sides_of_order(calibrator, rows)
     try:
         results = fit_compared_calibrations(calibrator, rows)
+        unstated = geometric_result(results["geometric"])
+        rows, backlash = with_sides_of_order(calibrator, rows, result=unstated)
+        if backlash:
+            results = fit_compared_calibrations(calibrator, rows)
     except ImplausibleError:
         raise
     except IdentificationError:
