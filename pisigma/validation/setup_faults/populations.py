@@ -84,9 +84,9 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
     index = np.unique(np.linspace(0, len(rows.residual) - 1, _MAX_ROWS).round().astype(int))
     some = index if len(rows.residual) > _MAX_ROWS else np.arange(len(rows.residual))
     independent = rows.degrees_of_freedom / max(rows.value_count - rows.effective_parameters, 1.0)
-    found = []
+    found, one = [], _one_population(rows, some)
     for differing, Z, precision in _differences(rows):
-        fit = _Mixture(rows, Z, precision).fit_from_starts(some)
+        fit = _Mixture(rows, Z, precision).fit_from_starts(some, one)
         if fit.used > _most_used(rows.residual.shape[1]) * fit.values:
             continue
         second = np.zeros(count, dtype=bool)
@@ -181,16 +181,18 @@ class _Mixture:
     Z: Float64[np.ndarray, "rows values numbers"]
     precision: Float64[np.ndarray, " numbers"]
 
-    def fit_from_starts(self, some: Int64[np.ndarray, " some"]) -> _Fit:
-        """Fit the mixture to some rows from several starts, and assign all rows to a population."""
+    def fit_from_starts(self, some: Int64[np.ndarray, " some"], one: "_State") -> _Fit:
+        """Fit the mixture to some rows from several starts, and assign all rows to a population.
+
+        Args:
+            some: indices of the rows.
+            one: fit of one population.
+        """
         r, X, Z = self.rows.residual[some], self.rows.jacobian[some], self.Z[some]
         rng = np.random.default_rng(0)
         # Expectation maximisation finds local maxima, so it is started with alternating rows (two arms in turn) and at
         # random.
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (_STARTS - 1, len(some)))]
-        # The same errors and prior without a difference, which the mixture has to outperform.
-        alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
-        one = alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
         em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
         states = [em.run(em.start(start), _FIRST_ITERATIONS) for start in starts]
         state = em.run(max(states, key=lambda state: state.log_likelihood), MAX_ITERATIONS)
@@ -292,6 +294,13 @@ class _Em:
         logs = logs + np.log([1 - share, share])[:, None]
         odds = (logs[0] - logs[1]).clip(-500, 500)
         return 1 / (1 + np.exp(odds)), float(np.logaddexp(*logs).sum()) - self.r.size / 2 * math.log(variance)
+
+
+def _one_population(rows: OrderedRows, some: Int64[np.ndarray, " some"]) -> _State:
+    """Fit one population to some rows, with the errors and the prior of a mixture, which has to outperform it."""
+    X = rows.jacobian[some]
+    alone = _Em(rows.residual[some], X, X[:, :, :0], rows.precision)
+    return alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
 
 
 @dataclass(frozen=True)
