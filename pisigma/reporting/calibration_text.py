@@ -76,10 +76,12 @@ def _accuracy(summary: CalibrationSummary) -> str:
         summary.validation_errors,
         any(one.severity == "implausible" for one in summary.diagnostics),
     )
+    images = any(noise.sensor == "corner" for noise in summary.noise)
+    scatter = ", with the scatter of the images" if images else ""
     if figures is None and summary.predicted_rms_mm is not None and not implausible:
         return (
-            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, as predicted from the uncertainty "
-            "of the calibration; no row was held out."
+            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses{scatter}, as predicted from the "
+            "uncertainty of the calibration; no row was held out."
         )
     figures = figures or summary.calibrated
     if figures is None or not figures.models:
@@ -87,8 +89,6 @@ def _accuracy(summary: CalibrationSummary) -> str:
     (first, nominal), *_ = figures.models.items()
     *_, best = figures.models.values()
     than = f"; {first} {rms_text(nominal, figures.rows)}" if best is not nominal else ""
-    images = any(noise.sensor == "corner" for noise in summary.noise)
-    scatter = ", with the scatter of the images" if images else ""
     return f"{rms_text(best, figures.rows)} RMS{scatter}, {held_out_text(figures, summary)}{than}."
 
 

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.frames.shared_objects import uncertainty_of
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.intrinsics import (
     CAMERA_COLUMN,
@@ -20,7 +22,6 @@ from pisigma.measurement.sensors.intrinsics import (
 from pisigma.model.stored_starts import nearest_branch
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
-from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -164,14 +165,15 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnost
 
 
 def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]]:
-    """Predict the RMS error of a position over the joint space [m], and the shares of its square by unknown."""
+    """Predict the RMS error of a target's position over the joint space [m], and the shares of its square.
+
+    The position is that of the first target in the first frame.
+    """
     limits = torch.from_numpy(np.asarray(result.robot.limits)).clamp(-np.pi, np.pi)
     generator = torch.Generator().manual_seed(0)
     draws = torch.rand(_POSTURES, len(limits), generator=generator, dtype=torch.float64)
     q = limits[:, 0] + draws * (limits[:, 1] - limits[:, 0])
-    J = identification_jacobian(result.robot, q)[1][
-        :, :3, : result.solved.problem.space.arm_parameter_count
-    ].flatten(0, 1)
+    J = uncertainty_of(result).pose_derivatives(JointState(q), q)[:, :3].flatten(0, 1)
     posterior = result.posterior
     total = _square(J, posterior.covariance_root)
     groups = {"camera": "the intrinsics", "board": "the scale of the board"}
@@ -193,4 +195,4 @@ def _conditioned(root: Float64[Tensor, "unknowns directions"], rows: list[int]) 
 
 def _square(J: Tensor, root: Tensor) -> float:
     """Compute the mean square of a coordinate's predicted error [m²]."""
-    return float((J @ root[: J.shape[1]]).square().sum(1).mean())
+    return float((J @ root).square().sum(1).mean())

@@ -8,6 +8,7 @@ import pytest
 import torch
 from testing.camera_cell import BOARD, CAMERA, camera_cell
 
+from pisigma.calibration.frames.shared_objects import uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.geometric.result import CalibrationResult
@@ -65,6 +66,16 @@ def test_weaknesses_of_a_calibration_are_reported(
     reported = found(*calibrated(camera, intrinsics))
     assert set(reported) == expected
     assert (reported[LIMIT].values.get("share_intrinsics", 0.0) >= 0.1) == (intrinsics != "fixed")
+
+
+def test_the_predicted_error_includes_base_and_tool() -> None:
+    rows, result = calibrated()
+    q = 6.28 * torch.rand(200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 3.14
+    sigma = uncertainty_of(result).sigma(
+        Measurements(q=q, frame=rows.frame[:1] * 200, target=rows.target[:1] * 200)
+    )
+    rms = float(sigma.square().sum(1).mean().sqrt())
+    assert found(rows, result)[LIMIT].values["predicted_mm"] == pytest.approx(1e3 * rms, rel=0.1)
 
 
 def test_frontal_views_and_a_single_branch_are_named() -> None:
