@@ -92,7 +92,7 @@ def test_healthy_robots_get_no_warning_of_their_errors(shared_data: Path, robot:
     assert not unusual(result)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(4))
 def test_usual_errors_get_no_warning(seed: int) -> None:
     arm = simulate("ur10", seed, 60, 5e-5)
     assert not unusual(GeometricCalibrator(arm.nominal).fit(arm.measurements))

@@ -38,7 +38,7 @@ def session(seed, moved=None, joint=0, degrees=(0.0, 0.0), positions=("leader", 
     return compare_paired_arms(logs["leader"], logs["follower"], NAMES, **zeros)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(20))
 def test_a_difference_of_2_deg_is_named_with_its_sign_and_arm(seed):
     joint, sign, moved = seed % 4, (-1) ** (seed // 2), ("leader", "follower")[seed % 2]
     for positions in (("leader", "follower"), ("follower",)):

@@ -48,7 +48,7 @@ def with_backlash(name: str, seed: int) -> tuple[Robot, Measurements, list[int]]
     return arm.robot, arm.measured(logged=logged), joints
 
 
-@pytest.mark.parametrize("name", ["kr10", "rail"])
+@pytest.mark.parametrize("name", ["kr10", "scara", "rail"])
 def test_backlash_is_found_with_its_joints_and_size_and_is_no_lag_and_no_second_frame(name):
     robot, rows, joints = with_backlash(name, 3)
     found = unstated_backlash(GeometricCalibrator(robot), sided(rows))
@@ -60,7 +60,7 @@ def test_backlash_is_found_with_its_joints_and_size_and_is_no_lag_and_no_second_
     assert [*check_lag(check), *check_two_populations(check)] == []
 
 
-@pytest.mark.parametrize("name", ["kr10", "scara"])
+@pytest.mark.parametrize("name", ["kr10", "scara", "rail"])
 def test_rows_without_backlash_or_in_another_order_are_accepted(name):
     robot, rows, _ = with_backlash(name, 4)
     shuffled = rows.select(torch.randperm(rows.rows, generator=torch.Generator().manual_seed(1)))
@@ -92,7 +92,7 @@ def loaded_arm(seed: int, play_deg: float) -> tuple[Robot, Measurements]:
     return nominal, replace(rows, position=position + torch.from_numpy(rng.normal(0, 3e-5, (54, 3))))
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, 4, 5])
 def test_backlash_that_is_smaller_than_the_sag_is_found(seed):
     robot, rows = loaded_arm(seed, 0.02)
     calibrator = GeometricCalibrator(robot)
@@ -103,8 +103,9 @@ def test_backlash_that_is_smaller_than_the_sag_is_found(seed):
     assert unstated_backlash(calibrator, replace(rows, approach=torch.from_numpy(drawn))) is None
 
 
-def test_error_of_commanded_poses_is_that_of_the_measured_tool():
-    rng, nominal = np.random.default_rng(0), Robot.load("ur5")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_error_of_commanded_poses_is_that_of_the_measured_tool(seed):
+    rng, nominal = np.random.default_rng(seed), Robot.load("ur5")
     robot = nominal.with_geometry(nominal.dh + dh_errors(nominal, 5e-4, 5e-4, rng), base=BASE, tool=TOOL)
     q = draw_joints(nominal, 54, rng)
     rows = sided(Measurements(q, torch.zeros(54, 3).double(), line=tuple(range(2, 56)), source="rows.csv"))
@@ -112,12 +113,12 @@ def test_error_of_commanded_poses_is_that_of_the_measured_tool():
     position = true.forward(q, rows.approach.nan_to_num(1.0))[:, :3, 3]
     noise = torch.from_numpy(rng.normal(0, 3e-5, (54, 3)))
     found = unstated_backlash(GeometricCalibrator(nominal), replace(rows, position=position + noise))
-    assert 6 in found.values["joints"]  # joint 1 is named, too, with 0.004 deg
+    assert 6 in found.values["joints"]  # with seed 0, joint 1 is named, too, with 0.004 deg
     error = (position - forward_kinematics(robot, q)[:, :3, 3]).norm(dim=1)
     assert_close(found.values["error_mm"], float(error.square().mean().sqrt()) * 1e3, rtol=0.3)
 
 
-@pytest.mark.parametrize("seed", [1, 5])
+@pytest.mark.parametrize("seed", [1, 4, 5])
 def test_an_elastic_arm_under_load_without_play_raises_no_alarm(seed):
     robot, rows = loaded_arm(seed, 0.0)
     assert unstated_backlash(GeometricCalibrator(robot), sided(rows)) is None

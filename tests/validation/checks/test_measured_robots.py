@@ -1,5 +1,6 @@
 """What the checks say of measured robots: nothing while they are healthy, and the fault where one was made."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from testing.checked import checked, kinds_of
+from testing.hybrid import few_robots
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import ImplausibleError
@@ -54,10 +56,15 @@ def test_healthy_robots_have_no_diagnostic(shared_data, robot, step):
     assert kinds_of(calibrator(robot, rows), rows) == []
 
 
-@pytest.mark.parametrize(("robot", "measured"), [("ur5", "ur10"), ("ur10", "ur5")])
-def test_another_robot_is_named(shared_data, robot, measured):
+@pytest.mark.parametrize(
+    ("robot", "measured", "catalogue"),
+    [("ur5", "ur10", nullcontext), ("ur10", "ur5", few_robots)],
+    ids=("all", "few"),
+)
+def test_another_robot_is_named(shared_data, robot, measured, catalogue):
     rows = rows_of(shared_data, measured, 20)
-    diagnostics = diagnostics_of(checked(calibrator(robot, rows), rows))
+    with catalogue():
+        diagnostics = diagnostics_of(checked(calibrator(robot, rows), rows))
     assert {one.kind for one in diagnostics if one.severity == "implausible"} >= {
         "other_robot",
         "prior_ratio",

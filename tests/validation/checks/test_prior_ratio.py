@@ -5,12 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.checked import kinds_of
+from testing.hybrid import few_robots
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.validation.setup_faults.nominal_robot_faults import find_nominal_robot_faults
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """See `few_robots`; whether another robot was measured is tested in `test_measured_robots`."""
+    with few_robots():
+        yield
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from testing.checked import checked, kinds_of
+from testing.hybrid import few_robots
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
@@ -12,7 +13,15 @@ from pisigma.robot.se3 import rotation_from_vector
 from pisigma.validation.checks.unexplained import check_residual
 
 
-@pytest.mark.parametrize(("size", "joint"), [(1.0, 4), (5e-3, 0)])
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """See `few_robots`; whether another robot was measured is tested in `test_measured_robots`."""
+    with few_robots():
+        yield
+
+
+@pytest.mark.parametrize("size", [1.0, 5e-3])
+@pytest.mark.parametrize("joint", [0, 4])
 def test_positions_that_are_unrelated_to_the_only_joint_that_moves(generator, joint, size):
     q = torch.full((40, 6), 0.3, dtype=torch.float64)
     q[:, joint] = torch.linspace(-1.5, 1.5, 40)

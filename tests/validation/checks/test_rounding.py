@@ -25,7 +25,8 @@ def rounded(arm: OutsideArm, degrees: float) -> np.ndarray:
     return np.round(arm.q / step) * step
 
 
-@pytest.mark.parametrize(("name", "degrees"), list(zip(ARMS, (1.0, 0.1, 1.0, 0.1, 0.1), strict=True)))
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("degrees", [1.0, 0.1])
 def test_rounded_joint_values_are_named_with_their_step_and_error(name, degrees):
     arm = OutsideArm(name, 3)
     rows = arm.measured(logged=rounded(arm, degrees))
@@ -38,7 +39,8 @@ def test_rounded_joint_values_are_named_with_their_step_and_error(name, degrees)
     assert_close(rounding.rms_error, np.sqrt(np.square(moved).sum(1).mean()), rtol=0.15)
 
 
-@pytest.mark.parametrize(("name", "degrees"), list(zip(ARMS, (1.0, 0.1, 0.01, 1.0, 0.01), strict=True)))
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("degrees", [1.0, 0.1, 0.01])
 def test_poses_at_round_values_and_fine_steps_are_accepted(name, degrees):
     arm = OutsideArm(name, 5)
     if degrees > 0.05:  # sent to round values

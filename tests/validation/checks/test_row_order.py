@@ -134,7 +134,7 @@ def test_valid_rows_in_any_order_are_accepted(seed: int, rows: int, wrong: float
     assert found(simulated.nominal, in_order) == []
 
 
-@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (10, 20), (3, 24)])
+@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (7, 20), (10, 20), (3, 24), (6, 24), (7, 24)])
 def test_few_rows_of_an_arm_with_gears_are_accepted(seed: int, rows: int) -> None:
     """What motions and parameters could follow to the noise, as they are nearly as many as the values."""
     simulated = simulate("ur5", seed=seed, rows=rows)
@@ -186,7 +186,7 @@ def test_what_two_frames_leave_unexplained_is_no_motion_of_the_tool(shift, frame
     assert bool(found(simulated.nominal, rows)) == reported
 
 
-@pytest.mark.parametrize(("name", "draw"), [("rail", 1), ("scara", 1)])
+@pytest.mark.parametrize(("name", "draw"), [("rail", 1), ("rail", 2), ("scara", 1)])
 def test_repeats_of_few_poses_are_no_evidence_of_a_motion(name: str, draw: int) -> None:
     outside = OutsideArm(name, 3, 20, draw)
     outside.q = np.repeat(outside.q, 3, 0)

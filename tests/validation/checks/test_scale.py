@@ -78,7 +78,7 @@ def test_a_scale_is_looked_for_in_every_calibration(shared_data):
     assert ("scale", "implausible") in kinds_of(GeometricCalibrator(Robot.load("ur5")), rows)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(5))
 def test_errors_of_single_lengths_are_no_scale(seed):
     arm = simulate("ur10", seed, rows=60, noise=5e-5)
     assert common_scale(GeometricCalibrator(arm.nominal).fit(arm.measurements)).log_bayes_factor < 0

@@ -50,7 +50,7 @@ def test_parallel_axes_leave_unknowns_undetermined() -> None:
     )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_poses_of_a_robot_with_parallel_axes_start_well_wherever_base_and_tool_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
     base, tool = (np.concatenate([rng.normal(size=3), rng.uniform(-1.5, 1.5, 3)]) for _ in range(2))
