@@ -9,7 +9,7 @@ from hostile.kinds import KINDS, make, shares
 from hostile.outcome import attempt
 from testing.models import no_type_checker
 
-COUNT, SEED = 100, 0
+COUNT, SEED = 200, 0
 MAX_MEMORY_GROWTH = 10**6
 """Maximum growth of the tests' memory [kB]."""
 
