@@ -86,7 +86,7 @@ def amplitudes(both: RefinedFit, prior: GaussianPrior) -> GaussianPrior:
     """Return the prior of series C with the amplitude of every harmonic of every joint in both series."""
     design, precision = both.design, prior.precision.clone()
     # base and tool of the other series are unknowns of the fit to both series, and precede the weights
-    shift = len(prior.base) - design.unknowns
+    shift = len(prior.unit_precision) - design.unknowns
     for number, feature in enumerate(design.features):
         if feature.name == "series":
             place = design.weights_of(number)
@@ -95,7 +95,7 @@ def amplitudes(both: RefinedFit, prior: GaussianPrior) -> GaussianPrior:
             sine, cosine = weight.chunk(2, 1)
             size = ((sine.square() + cosine.square()) / 2).repeat(1, 2)
             precision[place.start + shift : place.stop + shift] = 1 / size[feature.used]
-    return replace(prior, base=precision * prior.sizes[prior.group].square())
+    return replace(prior, unit_precision=precision * prior.sizes[prior.group].square())
 
 
 def error(solved: SolvedCalibration, refined: RefinedFit, rows: Measurements) -> float:

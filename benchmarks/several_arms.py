@@ -26,7 +26,7 @@ from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.estimation.loss import SquaredLoss
-from pisigma.lifetime.comparison.moved_bases import ArmBefore, find_moved_bases
+from pisigma.lifetime.comparison.moved_bases import RemeasuredArm, find_moved_bases
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.frame_model import frames_of_model
@@ -200,7 +200,7 @@ def find_bumped(
                 there = np.concatenate([values[number][:-12], base, values[number][-6:]])
                 images = measured(free, there, later[number], rng)
                 now.append(frames_of_model(models[number], images, "base"))
-            found = find_moved_bases([ArmBefore(*one) for one in zip(known, T, now, strict=True)])
+            found = find_moved_bases([RemeasuredArm(*one) for one in zip(known, T, now, strict=True)])
             text = " or ".join(one.name for one in found.likely_bodies) or "nothing"
             named[body, text if found.is_one_body else f"more than {text}"] += 1
             counts[body] += 1

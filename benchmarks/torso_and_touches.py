@@ -30,7 +30,7 @@ from pisigma.calibration.frames.shared_objects import ArmPosterior, Postures, To
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.estimation.loss import SquaredLoss
-from pisigma.lifetime.comparison.moved_bases import ArmBefore, find_moved_bases
+from pisigma.lifetime.comparison.moved_bases import RemeasuredArm, find_moved_bases
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.frame_model import frames_of_model
@@ -263,7 +263,7 @@ def find_zero(still: int) -> None:
                 later = Measurements(q=torso.later[k], position=p, frame=("hall",) * FEW)
                 now.append(frames_of_model(models[k], later, "base"))
             T = torch.stack([found.relative(0, k)[0] for k in range(2)])
-            what = find_moved_bases([ArmBefore(*one) for one in zip(known, T, now, strict=True)])
+            what = find_moved_bases([RemeasuredArm(*one) for one in zip(known, T, now, strict=True)])
             text = " or ".join(f"{one.kind} {one.name}" for one in what.likely_bodies) or "nothing"
             named[body, text if what.is_one_body else f"more than {text}"] += 1
             counts[body] += 1

@@ -6,7 +6,7 @@ import pytest
 
 from pisigma.cli.main import app
 from pisigma.model.folder.model_folder import load_model
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import number_text
 
 
 def _results(repository) -> dict[tuple[str, str], list[str]]:
@@ -23,9 +23,9 @@ def test_the_results_table_is_that_of_the_models(repository, model, joints):
     assert len(reports) == joints
     for report in reports:
         before, paper, _, fresh = table[model, report["name"]]
-        assert before == figure_text(report["training"]["before"]["average_deg"])
-        assert paper == figure_text(report["paper"]["after"]["average_deg"])
-        assert fresh == figure_text(report["held_out"]["after"]["average_deg"])
+        assert before == number_text(report["training"]["before"]["average_deg"])
+        assert paper == number_text(report["paper"]["after"]["average_deg"])
+        assert fresh == number_text(report["held_out"]["after"]["average_deg"])
 
 
 def test_training_readme_names_every_recipe(repository):

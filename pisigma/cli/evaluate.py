@@ -82,11 +82,11 @@ def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
 
 def _print(evaluation: "Evaluation", verbose: bool) -> None:
     """Print the verdict, warnings, and the errors of all models."""
-    from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
+    from pisigma.reporting.comparison_tables import comparison_blocks, model_rms_text
     from pisigma.reporting.verdict import Verdict
 
     rows = evaluation.rows
-    errors = ", ".join(f"{one.name} {model_rms(one, rows)}" for one in evaluation.models)
+    errors = ", ".join(f"{one.name} {model_rms_text(one, rows)}" for one in evaluation.models)
     fitted = [name for name, one in evaluation.evaluated_models.items() if one.trained_on]
     kind = f"; fit of {' and '.join(fitted)}, which these rows calibrated" if fitted else ""
     verdict = Verdict(

@@ -67,14 +67,15 @@ class FitResiduals:
         y: projected residuals in units of the stated noise.
         covariance_without_noise: projected covariance due to quantities known with a stated uncertainty and due to
             included causes.
-        exact: projected unit vectors of the values whose noise is exactly as stated, such as that of a prior.
+        exact_directions: projected unit vectors of the values whose noise is exactly as stated, such as that of a
+            prior.
         is_stated: whether the noise of the other values is stated.
         causes: projected derivatives with respect to the unknowns of every cause at size 1.
     """
 
     y: Float64[Tensor, " values"]
     covariance_without_noise: Float64[Tensor, "values values"]
-    exact: Float64[Tensor, "values _exact"]
+    exact_directions: Float64[Tensor, "values _exact"]
     is_stated: bool
     causes: Mapping[str, Float64[Tensor, "values _unknowns"]] = field(repr=False)
 
@@ -82,7 +83,7 @@ class FitResiduals:
     def from_fit(
         y: Float64[Tensor, " values"],
         fitted_columns: Float64[Tensor, "values unknowns"],
-        known_root: Float64[Tensor, "values directions"],
+        stated_covariance_root: Float64[Tensor, "values directions"],
         has_exact_noise: Bool[Tensor, " values"],
         is_stated: bool,
         causes: Mapping[str, Float64[Tensor, "values _columns"]],
@@ -92,14 +93,15 @@ class FitResiduals:
         Args:
             y: residuals in units of the stated noise.
             fitted_columns: derivatives with respect to the fitted unknowns.
-            known_root: root of the covariance of the residuals due to quantities known with a stated uncertainty.
+            stated_covariance_root: root of the covariance of the residuals due to quantities known with a stated
+                uncertainty.
             has_exact_noise: values whose noise is exactly as stated.
             is_stated: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
         """
         U = orthonormal_columns(fitted_columns)
         N = torch.linalg.qr(U, mode="complete")[0][:, U.shape[1] :].t()
-        A = N @ known_root
+        A = N @ stated_covariance_root
         columns = {name: compressed_columns(N @ Z) for name, Z in causes.items()}
         return FitResiduals(N @ y, A @ A.t(), N[:, has_exact_noise], is_stated, columns)
 
@@ -143,7 +145,10 @@ class FitResiduals:
 
     def _total(self, factor: float) -> Float64[Tensor, "values values"]:
         """Return the covariance with the noise of a factor, which values with exact noise do not have."""
-        total = self.covariance_without_noise + (1 - factor**2) * self.exact @ self.exact.t()
+        total = (
+            self.covariance_without_noise
+            + (1 - factor**2) * self.exact_directions @ self.exact_directions.t()
+        )
         total.diagonal().add_(factor**2)
         return total
 
@@ -238,14 +243,14 @@ class SessionEvidence:
         self._groups = tuple(hypotheses)
         self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 
-    def with_wrong(self, wrong_rows: Mapping[int, float]) -> "SessionEvidence":
+    def with_wrong_rows(self, wrong_rows: Mapping[int, float]) -> "SessionEvidence":
         """Return the evidence with other `LinearValues.wrong_configurations`."""
         other = copy(self)
         other.values = replace(self.values, wrong_configurations=wrong_rows)
         other._sigma = other.values.sigma(self._usual_noise)
         return other
 
-    def with_moved(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
+    def with_moved_groups(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
         """Return the evidence of the same rows if groups have moved, with their sizes as standard deviations."""
         other = copy(self)
         for one in groups:
@@ -299,7 +304,7 @@ class SessionEvidence:
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> Float64[Tensor, "values values"]:
         """Return the covariance of the values if groups have moved, with their sizes as standard deviations."""
-        return self.with_moved(groups)._K + self._noise(noise_factor).square().diag()
+        return self.with_moved_groups(groups)._K + self._noise(noise_factor).square().diag()
 
     def error_score(self) -> float:
         """Return the RMS of the values divided by their standard deviations if nothing moved; usually about 1."""

@@ -62,7 +62,7 @@ class LinearValues:
         y: weighted residuals of the model.
         sensor: index of every value's sensor.
         configuration: index of the joint values at which every value was measured.
-        counts: number of values of every sensor.
+        sensor_counts: number of values of every sensor.
         wrong_configurations: configurations with wrong measurements, with the factors on their noise.
         rejected: indices of the rows whose values the loss rejects; they have no values here.
     """
@@ -71,7 +71,7 @@ class LinearValues:
     y: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
     configuration: Int64[Tensor, " values"]
-    counts: tuple[SensorCount, ...]
+    sensor_counts: tuple[SensorCount, ...]
     wrong_configurations: Mapping[int, float] = field(default_factory=dict)
     rejected: frozenset[int] = frozenset()
 
@@ -91,7 +91,7 @@ class LinearValues:
     @property
     def has_exact_noise(self) -> Bool[Tensor, " values"]:
         """Mask of the values whose noise is exactly as stated."""
-        return torch.tensor([one.has_exact_noise for one in self.counts])[self.sensor]
+        return torch.tensor([one.has_exact_noise for one in self.sensor_counts])[self.sensor]
 
     @property
     def log_prior_penalty(self) -> float:
@@ -157,7 +157,7 @@ class DriftSearch:
             for number, group in enumerate(self._groups):
                 if not group.fixed_size:
                     self._resize(number, self._best_size(number))
-            for sensor, count in enumerate(self.values.counts):
+            for sensor, count in enumerate(self.values.sensor_counts):
                 if not count.has_exact_noise and count.values:
                     self._update_noise(sensor, 1.0 if count.has_stated_noise else 0.0)
             if before == [one.size for one in self._groups]:

@@ -60,7 +60,7 @@ class DualRegression(AbstractRegression):
         # alpha = V^-1 (y - G parameters); both weights and residuals are products with alpha.
         alpha = P @ self.y
         x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
-        square = prior.sum_by_group(x.square() * prior.base)
+        square = prior.sum_by_group(x.square() * prior.unit_precision)
         # A parameter is determined by the data to the extent that its posterior variance is below the prior variance.
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
@@ -188,7 +188,7 @@ def group_gram(X: Tensor, prior: GaussianPrior, group: int, active_count: int) -
     """Return the matrix K of one group of weights, whose columns in X follow the columns of the parameters."""
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active_count]
-    Z = X[:, columns] * prior.base[columns].rsqrt()
+    Z = X[:, columns] * prior.unit_precision[columns].rsqrt()
     return (Z @ Z.t()).flatten()[_upper_triangle(len(X))]
 
 

@@ -68,9 +68,9 @@ class HeldOutErrors:
         names = ("error", "spread", "sensor")
         return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
-    def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
+    def rms(self, noise: Sequence[float], reference_sigmas: Sequence[float]) -> float:
         """Return the RMS error relative to given standard deviations, such as the noise of another model."""
-        return float(self._squares(noise, unit).mean().sqrt())
+        return float(self._squares(noise, reference_sigmas).mean().sqrt())
 
     def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:
         """Return the decrease of the squared errors relative to another fit, in standard errors."""

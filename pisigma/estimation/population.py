@@ -148,7 +148,7 @@ def expectation_maximisation(
     evidence: Sequence[Information],
     start: Population,
     class_variances: Float64[Tensor, " unknowns"],
-    class_robots: float = _CLASS_ROBOTS,
+    class_weight_in_robots: float = _CLASS_ROBOTS,
     steps: int = _EM_STEPS,
 ) -> Population:
     """Estimate mean and covariance of the robots' errors by expectation-maximisation.
@@ -157,13 +157,16 @@ def expectation_maximisation(
         evidence: information on every robot.
         start: initial population.
         class_variances: variances of the robot class.
-        class_robots: weight of the class, in robots.
+        class_weight_in_robots: weight of the class, in robots.
         steps: number of steps.
     """
     population = start
     for _ in range(steps):
         population = _maximised(
-            evidence, population, class_robots * class_variances, class_robots + len(evidence)
+            evidence,
+            population,
+            class_weight_in_robots * class_variances,
+            class_weight_in_robots + len(evidence),
         )
     return population
 

@@ -47,7 +47,7 @@ class SolvedRegression:
         deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
         return deviation.square()
 
-    def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
+    def trace_of_product(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
         """Return the trace of a symmetric matrix times the covariance, which is computed block by block."""
         trace = 0.0
         for rows in row_blocks(len(self.x), BLOCK):
@@ -67,14 +67,14 @@ class PrimalRegression(AbstractRegression):
         descent: `Σ X^T y` for every sensor.
         squared_values: `Σ y^T y` for every sensor.
         sensors: number of values of every sensor.
-        latest: cache of the last solution, which evidence, held-out errors and covariance share.
+        latest_solution: cache of the last solution, which evidence, held-out errors and covariance share.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
     descent: Float64[Tensor, "sensors unknowns"]
     squared_values: tuple[float, ...]
     sensors: tuple[SensorCount, ...]
-    latest: list[SolvedRegression] = field(default_factory=list, init=False)
+    latest_solution: list[SolvedRegression] = field(default_factory=list, init=False)
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
@@ -82,7 +82,7 @@ class PrimalRegression(AbstractRegression):
         solved = self.solved_with(prior, noise)
         x, held = solved.x, precision * solved.variance
         pairs = zip(self.normal[1:], noise[1:], strict=True)
-        used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
+        used = [solved.trace_of_product(N) / sigma**2 for N, sigma in pairs]
         # All sensors together determine what the prior does not, which saves computing the trace of the first sensor.
         used.insert(0, float((1 - held).sum()) - sum(used))
         misfit = self._misfits(x)
@@ -90,13 +90,16 @@ class PrimalRegression(AbstractRegression):
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
         evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
         evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
-        square, determined = prior.sum_by_group(x.square() * prior.base), prior.sum_by_group(1 - held)
+        square, determined = (
+            prior.sum_by_group(x.square() * prior.unit_precision),
+            prior.sum_by_group(1 - held),
+        )
         return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """Return the covariance root of the unknowns: `D L^-T` with the names of `SolvedRegression`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
-        self.latest.clear()
+        self.latest_solution.clear()
         return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
 
     def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> SolvedRegression:
@@ -109,10 +112,18 @@ class PrimalRegression(AbstractRegression):
             memory.diagonal().add_(prior.precision)
             return memory
 
-        if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
-            return_free_memory(len(prior.base))
+        if (
+            not self.latest_solution
+            or self.latest_solution[0].prior is not prior
+            or self.latest_solution[0].noise != noise
+        ):
+            return_free_memory(len(prior.unit_precision))
             # The matrix may take gigabytes, so the memory of the previous factor is reused.
-            memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
+            memory = (
+                self.latest_solution.pop().inverse.mT
+                if self.latest_solution
+                else torch.empty_like(self.normal[0])
+            )
             descent = torch.zeros_like(self.descent[0])
             for b, sigma in zip(self.descent, noise, strict=True):
                 descent.add_(b, alpha=sigma**-2)
@@ -121,8 +132,8 @@ class PrimalRegression(AbstractRegression):
             inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
             x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
             invert_triangle(factor)
-            self.latest.append(SolvedRegression(prior, noise, scale, factor, log_det, x))
-        return self.latest[0]
+            self.latest_solution.append(SolvedRegression(prior, noise, scale, factor, log_det, x))
+        return self.latest_solution[0]
 
     def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
         """Return `Σ (y - X x)²` for every sensor."""

@@ -19,7 +19,7 @@ class GaussianPrior:
     """Independent normal unknowns: precision `base / sizes[group]²`.
 
     Attributes:
-        base: 1 / variance at size 1; 0 without a prior.
+        unit_precision: 1 / variance at size 1; 0 without a prior.
         group: index in `sizes` of every unknown.
         sizes: standard deviation of every group at base 1.
         class_count: number of leading groups that are classes of geometric parameters. Their sizes, which are factors
@@ -27,7 +27,7 @@ class GaussianPrior:
             harmonics resemble geometry, and if they could replace it, the arm would be wrong beyond this range.
     """
 
-    base: Float64[Tensor, " unknowns"]
+    unit_precision: Float64[Tensor, " unknowns"]
     group: Int64[Tensor, " unknowns"]
     sizes: Float64[Tensor, " groups"]
     class_count: int
@@ -35,11 +35,11 @@ class GaussianPrior:
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
         """Prior precision of every unknown, 1 / variance."""
-        return self.base / self.sizes[self.group].square()
+        return self.unit_precision / self.sizes[self.group].square()
 
     def sum_by_group(self, values: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " groups"]:
         """Return the sum of values over the unknowns of every group; unknowns without a prior are excluded."""
-        return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.base > 0))
+        return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.unit_precision > 0))
 
     def updated(
         self, squared_unknowns: Float64[Tensor, " groups"], determined_unknowns: Float64[Tensor, " groups"]

@@ -45,7 +45,7 @@ class Posterior:
     @property
     def effective_unknowns(self) -> float:
         """Effective number of unknowns that the data determine, including those without a prior."""
-        return float(self.determined_unknowns.sum()) + int((self.prior.base == 0).sum())
+        return float(self.determined_unknowns.sum()) + int((self.prior.unit_precision == 0).sum())
 
 
 @dataclass(frozen=True)

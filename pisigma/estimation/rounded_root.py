@@ -39,7 +39,7 @@ class RoundedRoot:
         """Return the root of some unknowns, by their indices."""
         return RoundedRoot(self.unit[rows], self.integers[rows])
 
-    def among(self, rows: list[int], count: int) -> "RoundedRoot":
+    def with_exact_unknowns(self, rows: list[int], count: int) -> "RoundedRoot":
         """Return the root of `count` unknowns: `rows` are the unknowns of this root, the others are exact."""
         unit, numbers = self.unit.new_zeros(count), self.integers.new_zeros(count, self.integers.shape[1])
         unit[rows], numbers[rows] = self.unit, self.integers

@@ -57,7 +57,7 @@ class Backlash(AbstractFeature):
             return torch.zeros_like(state.q)[..., None]
         return approach.to(state.q).nan_to_num(0.0).expand(state.q.shape)[..., None]
 
-    def unstated_root(
+    def unstated_covariance_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
         """Return half the backlash where the direction is not stated: the joint stops on one of the two sides."""

@@ -99,12 +99,14 @@ class ConditionFeatures(AbstractFeature):
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["ConditionFeatures", ...]:
         """Return the feature if a condition varies, otherwise an empty tuple."""
-        if not options.varying:
+        if not options.varying_conditions:
             return ()
-        values = torch.stack([state.conditions[name] for name in options.varying], 1)
+        values = torch.stack([state.conditions[name] for name in options.varying_conditions], 1)
         mean, spread = values.mean(0).tolist(), values.std(0).tolist()
         measured = [(float(low), float(high)) for low, high in zip(*values.aminmax(dim=0), strict=True)]
-        return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
+        return (
+            ConditionFeatures(robot, options.varying_conditions, mean, spread, measured, options.gravity),
+        )
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return products of conditions and functions of the joint values; 0 for mean, missing or NaN conditions."""

@@ -33,14 +33,14 @@ class FeatureOptions:
     Attributes:
         harmonics: numbers of harmonics of Fourier series, in the order in which they are tried.
         gravity: direction of gravity in the frame of the robot's first row.
-        configurations: number of different joint values that were measured.
-        varying: names of the conditions that all rows state and that vary.
+        configuration_count: number of different joint values that were measured.
+        varying_conditions: names of the conditions that all rows state and that vary.
     """
 
     harmonics: tuple[int, ...]
     gravity: tuple[float, float, float]
-    configurations: int
-    varying: tuple[str, ...] = ()
+    configuration_count: int
+    varying_conditions: tuple[str, ...] = ()
 
 
 class AbstractFeature(ABC):
@@ -63,7 +63,7 @@ class AbstractFeature(ABC):
         group_names: names of the groups of weights that have a common prior scale.
         size: size among features of the same name that are tried in sequence, such as the number of harmonics; 0 if
             there is only one.
-        fastest: highest harmonic of a joint value in the columns.
+        highest_harmonic: highest harmonic of a joint value in the columns.
     """
 
     name: ClassVar[str]
@@ -74,7 +74,7 @@ class AbstractFeature(ABC):
     group: Int64[Tensor, "dof columns"]
     group_names: tuple[str, ...]
     size: int = 0
-    fastest: int = 1
+    highest_harmonic: int = 1
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:
@@ -96,7 +96,7 @@ class AbstractFeature(ABC):
             state: joint values [rad or m], and further data of the rows.
         """
 
-    def unstated_root(
+    def unstated_covariance_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
         """Return a root R of the covariance R R^T of the corrections [rad or m] due to unstated conditions of rows.

@@ -146,7 +146,7 @@ class FourierSeries(AbstractFeature):
         super().__init__(robot)
         if harmonics < 1:
             raise ValueError(f"expected at least one harmonic of a Fourier series, got {harmonics}.")
-        self.harmonics = self.size = self.fastest = harmonics
+        self.harmonics = self.size = self.highest_harmonic = harmonics
         self.fine = fine
         self._rate = torch.from_numpy(angle_per_joint_value(robot))
         k = torch.arange(1, harmonics + 1)
@@ -171,8 +171,8 @@ class FourierSeries(AbstractFeature):
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["FourierSeries", ...]:
         """Return series of increasing size; above `USUAL_HARMONICS`, up to twice the number of configurations."""
-        most = max(2 * options.configurations, min(options.harmonics), USUAL_HARMONICS)
-        fine = options.configurations >= MANY_CONFIGURATIONS
+        most = max(2 * options.configuration_count, min(options.harmonics), USUAL_HARMONICS)
+        fine = options.configuration_count >= MANY_CONFIGURATIONS
         return tuple(FourierSeries(robot, k, fine) for k in options.harmonics if k <= most)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:

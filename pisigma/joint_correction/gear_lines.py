@@ -81,7 +81,7 @@ class GearLines(AbstractFeature):
         most = max((len(of_joint) for of_joint in self.orders), default=0)
         if len(self.orders) != robot.dof or not most:
             raise ValueError(f"expected orders for each of {robot.dof} joints, got {self.orders}.")
-        self.fastest = max(map(max, filter(None, self.orders)))
+        self.highest_harmonic = max(map(max, filter(None, self.orders)))
         self._rate = torch.from_numpy(angle_per_joint_value(robot))
         padded = [[*of_joint, *[0] * (most - len(of_joint))] for of_joint in self.orders]
         self._orders = torch.tensor(padded, dtype=torch.float64)

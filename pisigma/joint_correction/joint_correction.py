@@ -90,10 +90,10 @@ class JointCorrection(nn.Module):
             return total
         return total + sum_of_products(self.factors(state.q), self.orders)
 
-    def unstated_root(self, state: JointState) -> Float[Tensor, "*batch dof sources"]:
+    def unstated_covariance_root(self, state: JointState) -> Float[Tensor, "*batch dof sources"]:
         """Compute a root R of the covariance R R^T of the corrections [rad or m] due to unstated conditions of rows."""
         roots = [
-            feature.unstated_root(state, weight.detach().to(state.q))
+            feature.unstated_covariance_root(state, weight.detach().to(state.q))
             for feature, weight in zip(self.features, self.linear, strict=True)
         ]
         return torch.cat([state.q.new_zeros((*state.q.shape, 0)), *roots], -1)

@@ -44,9 +44,9 @@ class JointTorques(AbstractFeature):
 
     Where no torque is stated, τ_j is the modelled gravity torque `Σ_m g_jm m_jm`, with the columns g of
     `GravityTorques`, and m fitted to the measured torques of the calibration (ridge regression). It does not include a
-    payload that differs from the mean of the calibration; `unstated_root` therefore contains the differences between
-    measured and modelled torques, each modelled without the rows of its joint values. These differences are correlated,
-    because a payload loads several joints.
+    payload that differs from the mean of the calibration; `unstated_covariance_root` therefore contains the differences
+    between measured and modelled torques, each modelled without the rows of its joint values. These differences are
+    correlated, because a payload loads several joints.
 
     Source: Dumas, Caro, Garnier and Furet, Robotics and Computer-Integrated Manufacturing 27(4), 2011, 881-888: joint
         stiffness from torques; using measured instead of modelled torques is our choice.
@@ -120,7 +120,7 @@ class JointTorques(AbstractFeature):
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return the torques, stated or modelled, divided by their scale."""
-        q, modelled = state.q, self.modelled(state)
+        q, modelled = state.q, self.modelled_torques(state)
         stated = state.conditions.get(TORQUE)
         torque = modelled
         if stated is not None:
@@ -128,11 +128,11 @@ class JointTorques(AbstractFeature):
             torque = torch.where(torch.isfinite(stated), stated, modelled)
         return (torque * self._per_scale(q))[..., None]
 
-    def modelled(self, state: JointState) -> Float[Tensor, "*batch dof"]:
+    def modelled_torques(self, state: JointState) -> Float[Tensor, "*batch dof"]:
         """Return the modelled gravity torques [Nm or N]; 0 for joints without measured torques."""
         return (self._torques.columns(state) * state.q.new_tensor(self.model)).sum(-1)
 
-    def unstated_root(
+    def unstated_covariance_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
         """Return the deflections due to the differences between measured and modelled torques where none are stated."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.frames.arm_uncertainty import ArmUncertainty, positions_by_key
+from pisigma.calibration.frames.arm_uncertainty import ArmUncertainty, indices_by_key
 from pisigma.calibration.frames.frame_fit import FrameChoice, FrameFit, fit_frames
 from pisigma.calibration.frames.misfit_causes import misfit_causes
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
@@ -190,11 +190,11 @@ def _uncertainty(
     own = torch.cat([arm_root, fit.solved.covariance_root[fit.frame_indices]], 1)
     weights, directions = known.dense_root[len(old.parameters) :], known.dense_root.shape[1]
     root = torch.zeros(len(space.parameters) + len(weights), own.shape[1], dtype=torch.float64)
-    positions = positions_by_key(space.parameters)
-    for key, number in positions_by_key(old.parameters).items():
+    positions = indices_by_key(space.parameters)
+    for key, number in indices_by_key(old.parameters).items():
         if key in positions:
             root[positions[key], :directions] = known.dense_root[number]
-    fitted = positions_by_key(fit.parameters)
+    fitted = indices_by_key(fit.parameters)
     for key, number in fitted.items():
         root[positions[key]] = own[number]
     root[len(space.parameters) :, :directions] = weights

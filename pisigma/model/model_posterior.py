@@ -125,7 +125,7 @@ class ModelPosterior:
                 rows = replace(rows, **names)
         return rows
 
-    def positions_in(self, space: ParameterSpace) -> list[int]:
+    def parameter_indices_in(self, space: ParameterSpace) -> list[int]:
         """Return the indices of the parameters in a space that contains all their frames, targets and owners."""
         positions = list(range(self.space.arm_parameter_count))
         for group, names, among, size in (

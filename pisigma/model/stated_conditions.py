@@ -108,7 +108,7 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
         raise ModelError(
             expected=f"{model.robot.dof} finite torques, one per joint", value=torques_nm, option="torques_nm"
         )
-    usual = learned.modelled(JointState(model.starts.double())).abs().numpy().max(0, initial=0.0)
+    usual = learned.modelled_torques(JointState(model.starts.double())).abs().numpy().max(0, initial=0.0)
     largest = _MAX_TORQUE_RATIO * (usual + np.sqrt(np.diag(learned.covariance)))
     beyond = np.flatnonzero((np.abs(values) > largest) & (np.array(learned.scale) > 0))
     if len(beyond) and len(model.starts):
@@ -180,7 +180,7 @@ def _unlike_torques(name: str, learned: JointTorques, rows: Measurements) -> tup
     do.
     """
     assert rows.torque is not None
-    modelled, unlike = learned.modelled(JointState(rows.q)), list[str]()
+    modelled, unlike = learned.modelled_torques(JointState(rows.q)), list[str]()
     for joint, (tau, model, row) in enumerate(
         zip(rows.torque.t(), modelled.t(), learned.covariance, strict=True)
     ):

@@ -67,7 +67,7 @@ def repeated_row_warnings(
 def training_row_warnings(
     model: CalibratedModel,
     rows: Measurements,
-    file: Measurements | None = None,
+    all_rows: Measurements | None = None,
     consequence: str = "its figures say nothing about other poses",
 ) -> tuple[str, ...]:
     """Return a warning if rows on which a model is evaluated are among its training rows; empty otherwise.
@@ -78,11 +78,11 @@ def training_row_warnings(
     Args:
         model: model of any kind.
         rows: rows on which the model is evaluated.
-        file: all rows of the file, if `rows` are only some of them.
+        all_rows: all rows of the file, if `rows` are only some of them.
         consequence: clause of the warning that states the consequence.
     """
     training_hash = model.provenance.data_sha256
-    if training_hash and training_hash in (whole.content_hash() for whole in (rows, file or rows)):
+    if training_hash and training_hash in (whole.content_hash() for whole in (rows, all_rows or rows)):
         return (f"{model.name} was calibrated with these rows, so {consequence}.",)
     known = known_rows(model, rows)
     if bool(known.any()):

@@ -37,18 +37,18 @@ class BoardViews:
     Attributes:
         sight: camera and board.
         T_cell_frame: pose of the measuring frame (the board, or the fixed camera) in the frame of the nominal base [m].
-        nearest: smallest depth of a corner in front of the camera [m].
-        farthest: largest depth of a corner [m].
-        oblique: largest angle between the normal of the board and the line of sight to its centre [rad].
-        margin: distance that the board keeps from the edge of the image [px].
+        min_depth: smallest depth of a corner in front of the camera [m].
+        max_depth: largest depth of a corner [m].
+        max_incidence_angle: largest angle between the normal of the board and the line of sight to its centre [rad].
+        margin_px: distance that the board keeps from the edge of the image [px].
     """
 
     sight: BoardSight
     T_cell_frame: Float64[Tensor, "4 4"]
-    nearest: float
-    farthest: float
-    oblique: float
-    margin: float
+    min_depth: float
+    max_depth: float
+    max_incidence_angle: float
+    margin_px: float
 
     @staticmethod
     def from_sight(
@@ -117,14 +117,14 @@ class BoardViews:
         rays = torch.from_numpy(camera.undistort(pixels.numpy()))
         left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
-        least, most = max(self.nearest, fills), min(self.farthest, _MAX_DEPTH_RATIO * fills)
+        least, most = max(self.min_depth, fills), min(self.max_depth, _MAX_DEPTH_RATIO * fills)
         # Depths from where the board fills the image to where it is too small, within the stated distances.
         depth = least + (most - least) * draws[:, 2:3]
         middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
         direction, turn = 2 * math.pi * draws[:, 3:5].t()
         nothing = torch.zeros_like(turn)
         # Roll is the direction of the tilt and pitch its size; the board is then rotated in its own plane.
-        R = rotation_from_rpy(torch.stack([direction, self.oblique * draws[:, 5], nothing], 1))
+        R = rotation_from_rpy(torch.stack([direction, self.max_incidence_angle * draws[:, 5], nothing], 1))
         R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
         return transform(R, middle - R @ self._middle)
 
@@ -134,14 +134,14 @@ class BoardViews:
         T, T_cell_board = self._boards(arm, q)
         points, pixels, is_regular = self._shown(T)
         camera, oblique = self.sight.camera, self._obliqueness(T)
-        edge = pixels.new_tensor([camera.width, camera.height]) - self.margin
-        inside = ((pixels >= self.margin) & (pixels <= edge)).all(-1) & is_regular & (points[..., 2] > 0)
+        edge = pixels.new_tensor([camera.width, camera.height]) - self.margin_px
+        inside = ((pixels >= self.margin_px) & (pixels <= edge)).all(-1) & is_regular & (points[..., 2] > 0)
         faults = {
             "the camera is behind the board": oblique > math.pi / 2,
             "the board is not completely in the image": ~inside.all(1),
-            "a part of the board is too near to be sharp": points[..., 2].amin(1) < self.nearest,
-            "a part of the board is too far away to be sharp": points[..., 2].amax(1) > self.farthest,
-            "the board is seen too obliquely": oblique > self.oblique,
+            "a part of the board is too near to be sharp": points[..., 2].amin(1) < self.min_depth,
+            "a part of the board is too far away to be sharp": points[..., 2].amax(1) > self.max_depth,
+            "the board is seen too obliquely": oblique > self.max_incidence_angle,
         }
         corners = self._sheet @ T_cell_board[:, :3, :3].mT + T_cell_board[:, None, :3, 3]
         T_cell_camera = T_cell_board @ invert(T)

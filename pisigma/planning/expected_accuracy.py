@@ -114,7 +114,7 @@ def p95_of(task_derivatives: Float64[Tensor, "tasks 3 directions"], seed: int = 
     return float(torch.quantile(_drawn_errors(task_derivatives, DRAWS, seed).flatten(), 0.95))
 
 
-def p95_at(
+def p95_by_pose(
     task_derivatives: Float64[Tensor, "tasks 3 directions"], seed: int = 0
 ) -> Float64[Tensor, " tasks"]:
     """Compute the 95 % quantile of the position error at each pose [m] from `DRAWS_AT_POSE` robots of the posterior."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.reporting.result_text import Table
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import number_text
 from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_scatter
 from pisigma.validation.uncertainty.budget import COVERAGE
 
@@ -75,7 +75,7 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
             "standard deviation of a coordinate in repeated poses",
             "no pose was measured twice"
             if scatter is None
-            else f"{figure_text(scatter[0] * 1e3)} mm ({scatter[1]} degrees of freedom)",
+            else f"{number_text(scatter[0] * 1e3)} mm ({scatter[1]} degrees of freedom)",
         ),
         (
             "temperatures of the sessions",
@@ -91,7 +91,7 @@ def budget_table(acceptance: Acceptance) -> Table:
         (
             one.name,
             one.evaluation,
-            figure_text(one.standard_uncertainty * 1e3),
+            number_text(one.standard_uncertainty * 1e3),
             _freedom(one.degrees_of_freedom),
             one.source,
         )
@@ -106,11 +106,11 @@ def budget_table(acceptance: Acceptance) -> Table:
             (
                 "combined",
                 "",
-                figure_text(budget.combined_uncertainty * 1e3),
+                number_text(budget.combined_uncertainty * 1e3),
                 _freedom(freedom),
                 "root of the sum of squares",
             ),
-            ("expanded", "", figure_text(budget.expanded_uncertainty * 1e3), "", f"k = {k:.3f} for {_SHARE}"),
+            ("expanded", "", number_text(budget.expanded_uncertainty * 1e3), "", f"k = {k:.3f} for {_SHARE}"),
         ]
     return Table(
         ("component", "type", "standard uncertainty [mm]", "degrees of freedom", "source"), tuple(rows)
@@ -165,7 +165,7 @@ def iso_table(repeats: Sequence[RepeatedPose]) -> Table:
         if values:
             counts = f"{cycles[0]} to {cycles[-1]}" if len(cycles) > 1 else f"{cycles[0]}"
             mean = sum(values) / len(values)
-            rows.append((name, str(len(values)), counts, figure_text(mean), figure_text(max(values))))
+            rows.append((name, str(len(values)), counts, number_text(mean), number_text(max(values))))
         else:
             rows.append((name, "0", "", _NOT_STATED, _NOT_STATED))
     return Table(("ISO 9283:1998", "poses", "cycles", "mean [mm]", "largest [mm]"), tuple(rows))
@@ -178,4 +178,4 @@ def _freedom(value: float | None) -> str:
 
 
 def _figure(value: float) -> str:
-    return "" if math.isnan(value) else figure_text(value)
+    return "" if math.isnan(value) else number_text(value)

@@ -71,7 +71,7 @@ def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray, under: str) ->
     axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1), frameon=False, markerscale=2)
 
 
-def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Path) -> None:
+def draw_held_out_errors(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Path) -> None:
     """Draw the cumulative distribution of held-out errors, one line per model.
 
     Args:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
 from pisigma.reporting.rendering import sentences
 from pisigma.reporting.result_text import Table
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import number_text
 from pisigma.validation.held_out.calibration_summary import (
     CalibrationSummary,
     HybridFigures,
@@ -126,7 +126,7 @@ def curve_table(points: Sequence[LearningPoint]) -> Table:
     head += ["coverage [%]"] if has_coverage else []
     rows = []
     for point in points:
-        cells = [str(point.rows), *(figure_text(point.models[name].rms_mm or 0.0) for name in models)]
+        cells = [str(point.rows), *(number_text(point.models[name].rms_mm or 0.0) for name in models)]
         cells += [f"{100 * (point.coverage or 0.0):.1f}"] if has_coverage else []
         rows.append(tuple(cells))
     return Table(tuple(head), tuple(rows))

@@ -139,11 +139,11 @@ def scale_text(scale: ScaleFigures) -> str:
     return (
         f"scale of the sensor: lengths of the arm come out {scale.factor:.{digits}f} +- {scale.sigma:.{digits}f} "
         f"times nominal, with odds of {scale.odds:.2g} to 1 for one common factor, such as a wrong scale of the "
-        f"sensor, against an error of each link. {scale_error(scale)}"
+        f"sensor, against an error of each link. {scale_error_text(scale)}"
     )
 
 
-def scale_error(scale: ScaleFigures) -> str:
+def scale_error_text(scale: ScaleFigures) -> str:
     """Return a sentence on the consequence of a wrong scale of the sensor."""
     return (
         f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to the "
@@ -169,7 +169,7 @@ def calibration_text(
     found = [one.sentence for one in summary.diagnostics if one.kind == "scale"]
     remarks = []
     if summary.scale is not None and found:
-        warnings = [f"{one} {scale_error(summary.scale)}" if one in found else one for one in warnings]
+        warnings = [f"{one} {scale_error_text(summary.scale)}" if one in found else one for one in warnings]
     elif summary.scale is not None and scale_matters(summary):
         warnings = [scale_text(summary.scale), *warnings]
     elif summary.scale is not None and scale_matters(summary, _POSSIBLE_SCALE):

@@ -48,7 +48,7 @@ def write_calibration_card(
     """
     tables.write_parameters(summary.parameters, folder / model_files.PARAMETERS_CSV)
     geometric = geometric_result(result)
-    correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
+    correlations = (geometric.pairwise_redundancy.lengths, geometric.pairwise_redundancy.angles)
     tables.write_correlations(correlations, folder / model_files.CORRELATION_CSV)
     if pictures:
         _draw_calibration(result, rows, validation, summary, folder)
@@ -72,7 +72,7 @@ def _draw_calibration(
     )  # imported late because matplotlib takes 30 MB
 
     geometric = geometric_result(result)
-    correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
+    correlations = (geometric.pairwise_redundancy.lengths, geometric.pairwise_redundancy.angles)
     figures.draw_correlations(correlations, folder / model_files.CORRELATION_PNG)
     figures.draw_residuals(
         geometric.residuals,
@@ -81,7 +81,7 @@ def _draw_calibration(
     )
     if validation is not None:
         lengths = {name: errors.position.numpy() for name, errors in validation.all_errors.items()}
-        figures.draw_held_out(lengths, folder / model_files.HELD_OUT_PNG)
+        figures.draw_held_out_errors(lengths, folder / model_files.HELD_OUT_PNG)
         spread = validation.predicted_spread
         if spread is not None and spread.value_count:
             figures.draw_spread(spread, folder / model_files.SPREAD_PNG)

@@ -44,7 +44,7 @@ def comparison_tables(
     return [(title, one) for title, heads, lines in tables for one in _fitting(heads, lines, width)]
 
 
-def model_rms(figures: ModelFigures, rows: int) -> str:
+def model_rms_text(figures: ModelFigures, rows: int) -> str:
     """Return the RMS errors of a model as text."""
     errors = (figures.position, figures.orientation)
     return " and ".join(

@@ -16,7 +16,7 @@ from pisigma.reporting.frame_text import (
 )
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.result_text import Table
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import number_text
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
 from pisigma.validation.held_out.frame_summary import FrameSummary
@@ -103,7 +103,7 @@ def size_table(summary: DistillationSummary) -> Table:
             ", ".join(map(str, size.orders)),
             str(size.harmonics),
             str(size.unknowns),
-            figure_text(size.rms_mm),
+            number_text(size.rms_mm),
             "yes" if size.kept else "no",
         )
         for size in summary.sizes
@@ -117,14 +117,14 @@ def correction_table(summary: DistillationSummary) -> Table:
     rows = []
     for joint in summary.joints:
         figures = [getattr(part, name) for part in (joint.correction, joint.error) for name, _ in _STATISTICS]
-        rows.append((joint.name, joint.unit, *(figure_text(value) for value in figures)))
+        rows.append((joint.name, joint.unit, *(number_text(value) for value in figures)))
     return Table(("joint", "unit", *head), tuple(rows))
 
 
 def _range_table(summary: DistillationSummary) -> Table:
     """Return a table of the joints: smallest and largest nominal value among the poses."""
     joints = summary.region.joints
-    rows = ((joint.name, joint.unit, figure_text(joint.lower), figure_text(joint.upper)) for joint in joints)
+    rows = ((joint.name, joint.unit, number_text(joint.lower), number_text(joint.upper)) for joint in joints)
     return Table(("joint", "unit", "lowest", "highest"), tuple(rows))
 
 
@@ -148,13 +148,13 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
         "fleet_prior_card.md.j2",
         model=model,
         summary=summary,
-        parameters=common_table(summary),
+        parameters=common_error_table(summary),
         undetermined=UNDETERMINED,
         spectrum=spectrum_table(summary),
     )
 
 
-def common_table(summary: FleetPriorSummary) -> Table:
+def common_error_table(summary: FleetPriorSummary) -> Table:
     """Return a table of the mean and the standard deviation between robots of every geometric parameter."""
     rows = (
         (one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}", "in a sum" if one.in_a_sum else "")

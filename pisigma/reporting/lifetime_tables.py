@@ -52,7 +52,7 @@ def difference_table(differences: ParameterDifferences, model_names: tuple[str, 
 def _difference_row(one: ParameterDifference) -> tuple[str, ...]:
     """Return the row of a parameter; without a test, the cells of its shift are empty."""
     values = (f"{value:.4f}" for value in (one.first, one.second))
-    if one.shift is None or one.sigma is None or one.p is None:
+    if one.shift is None or one.sigma is None or one.p_value is None:
         return (one.name, one.unit, *values, _NO_VALUE, _NO_VALUE, _NO_VALUE)
-    p = "<0.0001" if one.p < 1e-4 else f"{one.p:.2g}"
+    p = "<0.0001" if one.p_value < 1e-4 else f"{one.p_value:.2g}"
     return (one.name, one.unit, *values, f"{one.shift:z.4f}", f"{NORMAL_95 * one.sigma:.4f}", p)

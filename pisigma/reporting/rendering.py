@@ -12,9 +12,9 @@ from pisigma.files.templates import template_environment
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import (
     distance_table,
-    figure_text,
     joint_table,
     markdown_table,
+    number_text,
     p_text,
     percent_text,
     pose_table,
@@ -71,7 +71,7 @@ def _environment() -> jinja2.Environment:
     return template_environment(
         "pisigma.reporting",
         {
-            "figure": figure_text,
+            "figure": number_text,
             "digits": "{:.4g}".format,
             "code": markup_with_code,
             "column_classes": column_classes,

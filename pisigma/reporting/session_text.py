@@ -76,7 +76,7 @@ def step_lines(step: SessionStep) -> Iterator[str]:
     for point in step.points:
         yield f"Accuracy {accuracy_text(point)}"
     if lines or step.points:
-        yield next_text(state)
+        yield next_pose_text(state)
 
 
 def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
@@ -106,7 +106,7 @@ def row_text(state: SessionState, row: int) -> str:
     return f"{error * 1e3:.2f} mm from what the other rows predict{kind}"
 
 
-def next_text(state: SessionState) -> str:
+def next_pose_text(state: SessionState) -> str:
     """Return a text about the next pose."""
     following = state.next_pose
     if following is None:
@@ -140,7 +140,7 @@ def session_page(step: SessionStep | None, state: SessionState, title: str) -> "
     ]
     return Group(
         Text(make_printable(title), style="bold"),
-        Text(next_text(state)),
+        Text(next_pose_text(state)),
         Text(make_printable(state.advice.sentence, cut=False), style=colour),
         *([Text(f"Waiting: {make_printable(waiting, cut=False)}", style="dim")] if waiting else []),
         *(Text(alarm, style="red") for alarm in alarms),

@@ -17,7 +17,7 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def figure_text(value: float) -> str:
+def number_text(value: float) -> str:
     """Return a figure with four decimals, or two digits and an exponent below 0.001; NaN as "unknown"."""
     if math.isnan(value):
         return "unknown"
@@ -47,7 +47,7 @@ def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
         ):
             if errors is not None:
                 figures = (*errors.before.values, *errors.after.values)
-                lines.append((joint.name, errors.before.unit, label, *map(figure_text, figures)))
+                lines.append((joint.name, errors.before.unit, label, *map(number_text, figures)))
     return lines
 
 
@@ -64,7 +64,7 @@ def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
         models: errors by the name of the model.
     """
     figures = [errors.figures_by_name for errors in models.values()]
-    rows = [(*_with_unit(name), *(figure_text(errors[name]) for errors in figures)) for name in figures[0]]
+    rows = [(*_with_unit(name), *(number_text(errors[name]) for errors in figures)) for name in figures[0]]
     return Table(("error", "unit", *models), tuple(rows))
 
 
@@ -80,7 +80,7 @@ def distance_table(distances: SocketDistances) -> Table:
         (
             " to ".join(one.sockets),
             f"{one.stated_mm:.6g}",
-            *(figure_text(one.errors_mm[name]) for name in models),
+            *(number_text(one.errors_mm[name]) for name in models),
         )
         for one in distances.each
     ]

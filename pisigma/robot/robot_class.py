@@ -175,7 +175,7 @@ CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, C
 """Classes of robots by name, in the order of increasing errors."""
 
 
-def plausible_share(robot: Robot) -> float:
+def plausible_error_per_reach(robot: Robot) -> float:
     """Return the largest errors of a calibrated robot, and after correction of a fault, as a share of the reach.
 
     They are larger for arms whose joints scatter by more, such as arms of servos.

@@ -121,15 +121,15 @@ class Jobs:
         with self._lock:
             return self.running, self.version, self.ended
 
-    def stop(self, person: str, ended_steps: str) -> None:
+    def stop(self, person: str, ended_step_count: str) -> None:
         """Stop the running step when it next reports progress; no incomplete files are left.
 
         Args:
             person: who stops the step.
-            ended_steps: number of steps that had ended when the person decided; a later step is not stopped.
+            ended_step_count: number of steps that had ended when the person decided; a later step is not stopped.
         """
         with self._lock:
-            if self.running is not None and ended_steps == str(self.ended):
+            if self.running is not None and ended_step_count == str(self.ended):
                 self.running.stopped_by = person
                 self.version += 1
 

@@ -26,7 +26,7 @@ from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
-from pisigma.validation.checks.backlash import with_sides_of_order
+from pisigma.validation.checks.backlash import with_approach_by_order
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
 from pisigma.validation.checks.row_order import explain_refusal
@@ -151,7 +151,7 @@ def calibrate(
         some = replace(training, approach=every.split_sets()[0].approach)
         return some if drawn is None else some.select(drawn)
 
-    measurements, backlash = with_sides_of_order(geometric_of(calibrator), measurements, calibrated)
+    measurements, backlash = with_approach_by_order(geometric_of(calibrator), measurements, calibrated)
     sided, test_rows = measurements.split_sets()
     training, rows = replace(training, approach=sided.approach), calibrated(measurements)
     faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))

@@ -264,7 +264,7 @@ def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
         "shift_deviation": one.sigma,
     }
     with_unit = {f"{name}_{one.unit}": value for name, value in figures.items()}
-    return {"name": one.name, **with_unit, "p": one.p, "equivalent": list(one.equivalent)}
+    return {"name": one.name, **with_unit, "p": one.p_value, "equivalent": list(one.equivalent_parameters)}
 
 
 def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...]:

@@ -253,7 +253,7 @@ def _limitations(
         "errors of the parent model add to these."
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
-    harmonics = max((one.fastest for one in features), default=1)
+    harmonics = max((one.highest_harmonic for one in features), default=1)
     inputs = next(size.harmonics for size in sizes if size.kept)
     if harmonics > inputs:
         sentences.append(

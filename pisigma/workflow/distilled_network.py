@@ -74,7 +74,7 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
         IdentificationError: there are too few poses for any size.
     """
     learned = () if model.hybrid is None else model.hybrid.correction.features
-    rippled = any(features.fastest > 1 for features in learned)
+    rippled = any(features.highest_harmonic > 1 for features in learned)
     sizes = tuple(
         size
         for size in (_RIPPLED if rippled else _SMOOTH)

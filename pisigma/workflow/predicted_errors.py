@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.planning.expected_accuracy import p95_at
+from pisigma.planning.expected_accuracy import p95_by_pose
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.validation.held_out.judged_rows import tool_positions
 from pisigma.validation.report.error_map import samples_of_workspace
@@ -38,5 +38,5 @@ def predicted_errors(model: CalibratedModel) -> PredictedErrors:
         IdentificationError: the model stores no posterior.
     """
     posterior, (q, _) = RobotPosterior.from_model(model), samples_of_workspace(model)
-    p95 = [p95_at(posterior.tool_derivatives(some)) for some in torch.split(q, _POSES_PER_CHUNK)]
+    p95 = [p95_by_pose(posterior.tool_derivatives(some)) for some in torch.split(q, _POSES_PER_CHUNK)]
     return PredictedErrors(tool_positions(model, q), torch.cat(p95))

@@ -39,7 +39,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.derived_cards import write_recalibration_card
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.validation.checks.check import MOVES, Move
 from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
@@ -251,7 +251,7 @@ def _believable(choice: CandidateChoice, robot: Robot) -> bool:
     error, kept = choice.rms["recalibrated"], choice.rms[choice.kept]
     if error is None or kept is None:
         return not choice.rows
-    return error <= min(plausible_share(robot) * robot.reach, CLEAR_RATIO * kept)
+    return error <= min(plausible_error_per_reach(robot) * robot.reach, CLEAR_RATIO * kept)
 
 
 def _summary(

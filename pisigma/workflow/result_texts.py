@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction_sentence
-from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
+from pisigma.reporting.comparison_tables import comparison_blocks, model_rms_text
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
 from pisigma.reporting.result_text import ResultText, sentences, table_block
@@ -114,7 +114,7 @@ def verification_text(verification: Verification, width: int, verbose: bool = Fa
     """
     trust = {"better": "yes", "undecided": "not known"}.get(verification.verdict, "no")
     figures, rows = verification.comparison.models, verification.rows
-    errors = f"{model_rms(figures[-1], rows)} RMS with the correction, {model_rms(figures[0], rows)} without"
+    errors = f"{model_rms_text(figures[-1], rows)} RMS with the correction, {model_rms_text(figures[0], rows)} without"
     command = f"run `{verification.recalibration_command}`."
     verdict = Verdict(
         f"{errors} ({rows} rows of {Path(verification.data).name}).",

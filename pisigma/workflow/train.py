@@ -156,9 +156,9 @@ def _train_geometric(
     errors = pose_errors_of(result, held_out).figures
     summary = summarise(result).with_figures(
         command=_call(recipe),
-        redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
-        no_effect=tuple(result.pairwise.no_effect),
-        pairwise_parameters=len(result.pairwise.kept),
+        redundant_sets=tuple(tuple(members) for members in result.pairwise_redundancy.sets),
+        no_effect=tuple(result.pairwise_redundancy.no_effect),
+        pairwise_parameters=len(result.pairwise_redundancy.kept),
         held_out=ValidationFigures(rows=held_out.rows, geometric=errors),
         paper=recipe.model_dump(mode="json")["paper"] or None,
     )

@@ -33,7 +33,7 @@ def random_case(values: int = VALUES, parameters: int = 0) -> tuple[Tensor, Tens
 
 def both_forms(X: Tensor, y: Tensor, prior: GaussianPrior) -> dict[str, AbstractRegression]:
     sensors = (SensorCount(float(len(y)), has_stated_noise=False, has_exact_noise=False),)
-    active = int((prior.base == 0).sum())
+    active = int((prior.unit_precision == 0).sum())
     primal = PrimalRegression((X.t() @ X)[None], (X.t() @ y)[None], (float(y @ y),), sensors)
     K = stack_groups([group_gram(X, prior, 1, active)], y)
     sensor = torch.zeros(len(y), dtype=torch.int64)

@@ -70,7 +70,7 @@ def test_packed_numbers_are_the_same_and_few() -> None:
     assert torch.equal(again.integers, rounded.integers)
     assert torch.equal(again.as_matrix, rounded.as_matrix)
     chosen = [0, *range(3, UNKNOWNS)]
-    placed = rounded.select(chosen).among(chosen, UNKNOWNS).as_matrix
+    placed = rounded.select(chosen).with_exact_unknowns(chosen, UNKNOWNS).as_matrix
     assert torch.equal(placed[chosen], rounded.as_matrix[chosen])
     assert not placed[1:3].any()
 

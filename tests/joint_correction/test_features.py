@@ -82,7 +82,7 @@ def test_lines_are_sines_and_cosines_of_the_orders_of_each_joint():
     lines = GearLines(robot, [(2_020,), (), (3, 405), ()])
     columns = lines.columns(JointState(q))
     assert lines.used.tolist() == [[True, False] * 2, [False] * 4, [True] * 4, [False] * 4]
-    assert lines.fastest == 2_020
+    assert lines.highest_harmonic == 2_020
     assert_close(columns[:, 0, 0], torch.sin(2_020 * q[:, 0]), atol=1e-12)
     assert_close(columns[:, 0, 2], torch.cos(2_020 * q[:, 0]), atol=1e-12)
     angle = torch.pi / 0.4 * q[:, 2]  # travel of 0.4 m

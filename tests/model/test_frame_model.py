@@ -90,7 +90,7 @@ def test_direction_that_is_held_is_uncertain_in_the_model():
     q[:, -1] = torch.linspace(-1, 1, 6)
     rows = Measurements(q=q, frame=("floor",) * 6, target=("C",) * 6, socket=("needle",) * 6)
     found = frames_of_model(model, rows, "tool")
-    assert found.fit.undetermined
+    assert found.fit.undetermined_indices
     assert found.model.uncertainty is not None
     deviation = found.model.uncertainty.sigma(rows)
     assert float(deviation.norm(dim=1).min()) > 0.05

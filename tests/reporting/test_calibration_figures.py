@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
-from pisigma.reporting.calibration_figures import draw_correlations, draw_held_out, draw_residuals
+from pisigma.reporting.calibration_figures import draw_correlations, draw_held_out_errors, draw_residuals
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -35,7 +35,7 @@ def test_a_panel_for_every_sensor(tmp_path, rng, scale):
 @pytest.mark.parametrize("scale", [0.0, 1e-16, 1e-4, 1.0])
 def test_errors_of_held_out_rows(tmp_path, rng, scale):
     lengths = np.append(scale * np.abs(rng.normal(size=20)), np.nan)
-    draw_held_out({"nominal": 10 * lengths, "geometric": lengths}, tmp_path / "held_out_errors.png")
+    draw_held_out_errors({"nominal": 10 * lengths, "geometric": lengths}, tmp_path / "held_out_errors.png")
     width, height = size(tmp_path / "held_out_errors.png")
     assert width > height > 300
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.reporting.tables import figure_text, joint_table, pose_table
+from pisigma.reporting.tables import joint_table, number_text, pose_table
 from pisigma.validation.held_out.training_summary import JointFigures
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
@@ -29,7 +29,7 @@ JOINTS = [
     [(0.0, "0.0000"), (1.23456, "1.2346"), (0.001, "0.0010"), (0.00012, "1.2e-04"), (-2e-5, "-2.0e-05")],
 )
 def test_small_figures_keep_two_digits(value, text):
-    assert figure_text(value) == text
+    assert number_text(value) == text
 
 
 def test_joint_table_has_a_line_per_joint_and_part_with_its_unit():

@@ -77,7 +77,7 @@ class DenseRegression(AbstractDesignRegression):
             log_evidence=evidence,
             prior=prior,
             noise=noise,
-            squared_unknowns=prior.sum_by_group(prior.base * x.square()),
+            squared_unknowns=prior.sum_by_group(prior.unit_precision * x.square()),
             determined_unknowns=prior.sum_by_group(1 - precision * covariance.diagonal()),
             misfit=self._by_sensor(residual.square()),
             effective_parameters=self._by_sensor(used),

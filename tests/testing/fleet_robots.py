@@ -29,8 +29,8 @@ def few_steps() -> Iterator[None]:
     """Estimate fleet priors with a twentieth of the steps, for tests of other subjects."""
     whole = population.expectation_maximisation
 
-    def with_few(evidence, start, class_variances, class_robots=population._CLASS_ROBOTS, steps=0):
-        return whole(evidence, start, class_variances, class_robots, steps=3)
+    def with_few(evidence, start, class_variances, class_weight_in_robots=population._CLASS_ROBOTS, steps=0):
+        return whole(evidence, start, class_variances, class_weight_in_robots, steps=3)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prior, "LINEARISATIONS", 1)

@@ -78,7 +78,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
         folder.mkdir()
         save_model(model, folder)
         (folder / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
-        pairwise = arm.result.geometric.pairwise
+        pairwise = arm.result.geometric.pairwise_redundancy
         write_correlations((pairwise.lengths, pairwise.angles), folder / CORRELATION_CSV)
     return model
 

@@ -44,7 +44,7 @@ def report_eliminations(
     Raises:
         RecipeError: A case names something other than a parameter of the arm.
     """
-    names = [name.removeprefix("-") for members in result.pairwise.sets for name in members]
+    names = [name.removeprefix("-") for members in result.pairwise_redundancy.sets for name in members]
     space = ParameterSpace(result.robot, (recipe.measurements.frame,), ("",))
     compared = []
     for removed in (*cases, ()):
@@ -90,7 +90,7 @@ def calibrate_without(
 
 def report_correlations(result: CalibrationResult) -> dict[str, Any]:
     """Return Pearson correlations of lengths and of angles (Park et al. 2022, Tables 3 to 6); None if undefined."""
-    pairwise = result.pairwise
+    pairwise = result.pairwise_redundancy
     return {"correlations": {"lengths": _table(pairwise.lengths), "angles": _table(pairwise.angles)}}
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from markdown_text import command_block, picture
-from pisigma.reporting.tables import figure_text, markdown_table
+from pisigma.reporting.tables import markdown_table, number_text
 from published import Published
 from stored_results import StoredResults
 
@@ -64,7 +64,7 @@ def joint_comparison(joints: Sequence[dict[str, Any]]) -> str:
     for joint in joints:
         for label, part in (("ours", "training"), ("paper", "paper"), ("ours, new poses", "held_out")):
             figures = [
-                figure_text(joint[part][when][f"{name}_deg"])
+                number_text(joint[part][when][f"{name}_deg"])
                 for when in ("before", "after")
                 for name in _STATISTICS
             ]

@@ -38,10 +38,10 @@ class ArmUncertainty:
             fitted_parameters: indices of the fitted parameters, whose uncertainty in the model does not matter.
         """
         root, fit_space = self.uncertainty.dense_root, solved.problem.space
-        positions = positions_by_key(self.uncertainty.space.parameters)
+        positions = indices_by_key(self.uncertainty.space.parameters)
         pairs = [
             (index, positions[key])
-            for key, index in positions_by_key(fit_space.parameters).items()
+            for key, index in indices_by_key(fit_space.parameters).items()
             if index not in fitted_parameters and key in positions
         ]
         values = WhitenedValues.at_solution(solved, [index for index, _ in pairs])
@@ -53,7 +53,7 @@ class ArmUncertainty:
         return spread
 
 
-def positions_by_key(parameters: tuple[Parameter, ...]) -> dict[tuple[str, str, str], int]:
+def indices_by_key(parameters: tuple[Parameter, ...]) -> dict[tuple[str, str, str], int]:
     """Return the position of every parameter by group, owner and column, a key that does not depend on other owners."""
     return {
         (one.group, one.owner, one.name.rsplit("_", 1)[-1]): number for number, one in enumerate(parameters)

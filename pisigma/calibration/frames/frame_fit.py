@@ -134,7 +134,7 @@ class FrameFit:
         )
 
     @property
-    def undetermined(self) -> frozenset[int]:
+    def undetermined_indices(self) -> frozenset[int]:
         """Indices of the coordinates that are uncertain because of a direction that the rows do not determine."""
         vectors, deviation = self._directions
         held = vectors[:, : self._held] * deviation[: self._held].clamp(max=LARGEST_DEVIATION)

@@ -96,7 +96,7 @@ def _residuals(
     return FitResiduals.from_fit(
         y=unit * (values.y + X_unknowns @ moved),
         fitted_columns=unit[:, None] * X_frames,
-        known_root=unit[:, None] * known,
+        stated_covariance_root=unit[:, None] * known,
         has_exact_noise=values.has_exact_noise,
         is_stated=bool(rows.is_measured("corner").any()),
         causes={name: unit[:, None] * Z for name, Z in causes.items()},

@@ -18,9 +18,9 @@ from pisigma.calibration.geometric.identifiability.redundancy import (
     find_redundancy,
 )
 from pisigma.calibration.geometric.identifiability.sufficiency import (
-    candidates_at_start,
+    count_estimated_unknowns,
     floating_bases,
-    free_parameters,
+    information_at_start,
     refuse_too_few,
     without_sensor_unknowns,
 )
@@ -158,7 +158,7 @@ class GeometricCalibrator:
         else:
             start = problem.combine_contributions(start.point, sensor_view_of(start))
         left = self.maximum_iterations - rough.iterations
-        fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
+        fine = levenberg_marquardt(problem, start, left, step_tolerance=SHORTEST_STEP)
         if setup.joint_repeatability:
             setup, problem, fine = self._weight_images(setup, problem, fine)
         refuse_implausible(problem, fine.linearisation, measurements.source)
@@ -181,7 +181,7 @@ class GeometricCalibrator:
             setup = replace(setup, joint_repeatability=factor * setup.joint_repeatability).weighted_at(point)
             problem = setup.problem.with_active(problem.active.tolist())
             left = max(self.maximum_iterations - found.iterations, 1)
-            again = levenberg_marquardt(problem, point, left, close_enough=SHORTEST_STEP)
+            again = levenberg_marquardt(problem, point, left, step_tolerance=SHORTEST_STEP)
             found = found.continued_by(again)
         return setup, problem, found
 
@@ -249,20 +249,20 @@ class GeometricCalibrator:
         problem, unknowns = setup.problem, setup.free_unknowns
         candidates, explicit = self.candidates(problem.space), not isinstance(self.free, str)
         every = information(problem, setup.start, unknowns + candidates)
-        candidates, at_start = candidates_at_start(setup, candidates, every)
-        sizes = setup.start.cpu().numpy()[candidates]
-        redundancy = find_redundancy(at_start, sizes)
+        candidates, at_start = information_at_start(setup, candidates, every)
+        nominal_values = setup.start.cpu().numpy()[candidates]
+        redundancy = find_redundancy(at_start, nominal_values)
         refuse_too_few(problem, redundancy, explicit, len(unknowns), source)
         floating = set(floating_bases(setup))
-        chosen = self._chosen(problem.space, sizes, redundancy)
+        chosen = self._chosen(problem.space, nominal_values, redundancy)
         active = [*(index for index in chosen if index not in floating), *unknowns]
-        estimated = free_parameters(redundancy, explicit, len(unknowns))
-        return RankFindings(sizes, redundancy, [], estimated), candidates, active
+        estimated_count = count_estimated_unknowns(redundancy, explicit, len(unknowns))
+        return RankFindings(nominal_values, redundancy, [], estimated_count), candidates, active
 
     def _chosen(
         self,
         space: ParameterSpace,
-        sizes: Float64[np.ndarray, " candidates"],
+        nominal_values: Float64[np.ndarray, " candidates"],
         redundancy: Redundancy,
     ) -> list[int]:
         """Return the indices of the parameters that are estimated first."""
@@ -270,7 +270,7 @@ class GeometricCalibrator:
             return [space.index(name) for name in redundancy.kept]
         names = redundancy.names
         if self.elimination == "pairwise":
-            names = find_pairwise_redundancy(redundancy.information, sizes).kept
+            names = find_pairwise_redundancy(redundancy.information, nominal_values).kept
         return [space.index(name) for name in names]
 
     def _solve_roughly(
@@ -288,7 +288,7 @@ class GeometricCalibrator:
         if problem.rows > _ROUGH_ROWS:
             problem = problem.select(randomly_chosen_rows(problem.rows, _ROUGH_ROWS).to(problem.q.device))
         steps = min(_ROUGH_STEPS, self.maximum_iterations)
-        rough = levenberg_marquardt(problem.without_prior(), setup.start, steps, close_enough=1.0)
+        rough = levenberg_marquardt(problem.without_prior(), setup.start, steps, step_tolerance=1.0)
         unknowns, here = setup.free_unknowns, rough.linearisation
         kept = sorted(set(active) - set(unknowns))
         others = [i for i in candidates if i not in set(kept)]

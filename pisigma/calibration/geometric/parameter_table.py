@@ -30,7 +30,7 @@ class PriorRatio:
     Attributes:
         kind: "length" or "angle".
         group: the group of parameters.
-        prior: smallest prior standard deviation of a parameter of the group [m or rad].
+        smallest_prior_sigma: smallest prior standard deviation of a parameter of the group [m or rad].
         value: the estimated ratio [1].
         lower_bound: the ratio minus two standard deviations. An estimate from n effective parameters has a relative
             standard deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
@@ -38,19 +38,19 @@ class PriorRatio:
 
     kind: Literal["length", "angle"]
     group: PriorGroup
-    prior: float
+    smallest_prior_sigma: float
     value: float
     lower_bound: float
 
     @property
     def size(self) -> float:
         """Estimated standard deviation of the errors [m or rad]."""
-        return self.value * self.prior
+        return self.value * self.smallest_prior_sigma
 
     @property
     def size_at_least(self) -> float:
         """The estimated standard deviation of the errors minus two of its own standard deviations [m or rad]."""
-        return self.lower_bound * self.prior
+        return self.lower_bound * self.smallest_prior_sigma
 
 
 def prior_ratios_of(

@@ -36,7 +36,7 @@ from pisigma.calibration.geometric.problem.least_squares import (
     SolutionStatus,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.noise import parameters_by_sensor, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import effective_parameters_by_sensor, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -202,10 +202,10 @@ class CalibrationResult:
         return self.solved.findings.redundancy
 
     @cached_property
-    def pairwise(self) -> PairwiseRedundancy:
+    def pairwise_redundancy(self) -> PairwiseRedundancy:
         """Redundancy by the Pearson correlation of pairs, as in Park et al. 2022."""
         findings = self.solved.findings
-        return find_pairwise_redundancy(findings.information, findings.sizes)
+        return find_pairwise_redundancy(findings.information, findings.nominal_values)
 
     @property
     def added_parameters(self) -> tuple[str, ...]:
@@ -253,7 +253,7 @@ class CalibrationResult:
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
         """Warnings about what the measurements do not determine, what to measure next, and what does not fit."""
         return (
-            *measurement_advice(self.solved.setup, self.solved.findings.estimated),
+            *measurement_advice(self.solved.setup, self.solved.findings.estimated_count),
             *_warnings(self.solved),
         )
 
@@ -331,7 +331,7 @@ def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
 def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
     """Return the residuals, rotated back into the measuring frames."""
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
-    R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
+    R = setup.reference_frames.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
     for sensor, part in zip(
         problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
@@ -362,7 +362,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     noise = []
     problem, here = solved.problem, solved.refined_linearisation
     view = sensor_view_of(here)
-    used = parameters_by_sensor(view, covariance_of(here.normal)).tolist()
+    used = effective_parameters_by_sensor(view, covariance_of(here.normal)).tolist()
     for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
         if sensor.is_stated:
             continue
@@ -373,7 +373,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
                 sensor=sensor.name,
                 sigma=sigma,
                 unit=unit,
-                values=problem.values_measured[k],
+                values=problem.measured_value_counts[k],
                 effective_parameters=used[k],
                 rms=float(part.rms),
                 quantity=sensor.unit,

@@ -25,7 +25,7 @@ from pisigma.calibration.hybrid.gravity import (
 )
 from pisigma.calibration.hybrid.refinement import (
     RefinedFit,
-    evaluate_in_chunks,
+    chunked_correction,
     linearise_rows,
     refine,
     with_aligned_frames,
@@ -148,7 +148,7 @@ class HybridCalibrator:
         progress("solving for all parameters")
         whole = solved.problem.rows == choice.rows.problem.rows
         refined = serving.refined if whole else refine(solved.problem, group, choice)
-        if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
+        if refined.regression.effective_share(refined.posterior) > choice.best.max_effective_share:
             return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
         falling = gravity_sentence(self.geometric_calibrator.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
@@ -273,7 +273,7 @@ class HybridCalibrator:
 def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, ...]:
     """Return the rows with less than half of the full weight in the hybrid calibration, worst first."""
     problem, setup, found = solved.problem, solved.setup, []
-    values = sensor_values(problem, refined.point, evaluate_in_chunks(refined.correction))
+    values = sensor_values(problem, refined.point, chunked_correction(refined.correction))
     weights = robust_weights(problem, values, refined.posterior.effective_unknowns)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]

@@ -14,8 +14,8 @@ from pisigma.calibration.hybrid.refinement import (
     CONVERGENCE_TOLERANCE,
     MAX_LINEARISATIONS,
     RefinedFit,
+    chunked_correction,
     correction_from_weights,
-    evaluate_in_chunks,
     linearise_rows,
     refine,
 )
@@ -50,17 +50,17 @@ class SensorErrors:
         group: index of every row's group, see `Rows.group`.
         fitted_errors: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
         held_out_errors: lengths of the errors in fits without the row's fold; NaN for rows that were not held out.
-        weight: robust weight, 1 for full weight and 0 for rejected rows.
+        robust_weight: robust weight, 1 for full weight and 0 for rejected rows.
     """
 
     group: Int64[Tensor, " values"]
     fitted_errors: Float64[Tensor, " values"]
     held_out_errors: Float64[Tensor, " values"]
-    weight: Float64[Tensor, " values"]
+    robust_weight: Float64[Tensor, " values"]
 
     def compare(self, before: "SensorErrors") -> "Comparison":
         """Return the comparison with errors under another fit, for the rows that either fit uses."""
-        weight = torch.maximum(self.weight, before.weight)
+        weight = torch.maximum(self.robust_weight, before.robust_weight)
         judged = torch.isfinite(
             before.held_out_errors
         )  # a fit that predicts no value is worse than any other fit
@@ -154,7 +154,7 @@ def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValu
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
     return sensor_values(
-        problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
+        problem, point, chunked_correction(correction_from_weights(design, x)) if design.features else None
     )
 
 
@@ -282,6 +282,6 @@ def _part(choice: FeatureChoice, features: tuple[AbstractFeature, ...]) -> Featu
     """Return the choice with a subset of its features as the best fit."""
     best, design = choice.best, Design(choice.rows.problem, features)
     fit = (choice.regression or build_regression(best.design, choice.rows)).select(design)
-    prior = design.prior_like(best.design, best.posterior.prior)
+    prior = design.prior_with_sizes_of(best.design, best.posterior.prior)
     posterior = fit.maximise_evidence(prior, best.posterior.noise, tolerance=ROUGH_TOLERANCE)
-    return replace(choice, best=FeatureFit(design, posterior, best.largest_share), regression=fit)
+    return replace(choice, best=FeatureFit(design, posterior, best.max_effective_share), regression=fit)

@@ -118,20 +118,20 @@ class Design:
             prior, sizes=torch.cat([prior.sizes[: prior.class_count], prior.sizes.new_tensor(sizes)])
         )
 
-    def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
+    def prior_with_sizes_of(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
         """Return a prior with the fitted sizes of another design; new bands get the size of its last band."""
         prior_here = self.prior(prior.sizes[: prior.class_count].tolist())
         sizes = prior_here.sizes.clone()
-        others = zip(other.features, other.group_starts(prior.class_count), strict=True)
+        others = zip(other.features, other.first_scale_indices(prior.class_count), strict=True)
         fitted = {like.name: (first, len(like.group_names)) for like, first in others}
-        for chosen, start in zip(self.features, self.group_starts(prior.class_count), strict=True):
+        for chosen, start in zip(self.features, self.first_scale_indices(prior.class_count), strict=True):
             if chosen.name in fitted:
                 first, count = fitted[chosen.name]
                 for number in range(len(chosen.group_names)):
                     sizes[start + number] = prior.sizes[first + min(number, count - 1)]
         return replace(prior_here, sizes=sizes)
 
-    def group_starts(self, class_count: int) -> list[int]:
+    def first_scale_indices(self, class_count: int) -> list[int]:
         """Return the index of the first prior scale of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
         return [class_count + sum(counts[:k]) for k in range(len(counts))]

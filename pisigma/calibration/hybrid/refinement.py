@@ -109,7 +109,7 @@ def correction_from_weights(design: Design, x: Float64[Tensor, " unknowns"]) -> 
     return made
 
 
-def evaluate_in_chunks(correction: JointCorrection) -> Shift:
+def chunked_correction(correction: JointCorrection) -> Shift:
     """Return a function that evaluates the correction for many rows in chunks, to limit the memory."""
     return lambda state: torch.cat([correction(state[rows]) for rows in chunks(len(state.q))])
 
@@ -128,7 +128,7 @@ def linearise_rows(
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
     values = sensor_values(
-        problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
+        problem, point, chunked_correction(correction_from_weights(design, x)) if design.features else None
     )
     return Rows.from_linearisation(
         design, x, values, robust_weights(problem, values, effective_unknowns), group
@@ -154,13 +154,15 @@ def with_aligned_frames(solved: SolvedCalibration, refined: RefinedFit) -> Ident
     with torch.no_grad():
         moved = replace(rows, q=rows.q + refined.correction.for_rows(rows))
     points = _points(geometry, moved), _points(solved.geometry, rows)
-    bases = setup.anchors.bases.clone()
+    bases = setup.reference_frames.bases.clone()
     for frame in frames:
         here = torch.tensor([name == frame for name in rows.frame])
         motion = fit_rigid_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
         number = setup.problem.space.frames.index(frame)
         bases[number] = motion.to(bases) @ bases[number]
-    return identified_geometry(replace(setup, anchors=replace(setup.anchors, bases=bases)), refined.point)
+    return identified_geometry(
+        replace(setup, reference_frames=replace(setup.reference_frames, bases=bases)), refined.point
+    )
 
 
 def fit_rigid_motion(

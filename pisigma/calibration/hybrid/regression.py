@@ -66,7 +66,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
         Existing sums are copied.
         """
-        self.latest.clear()
+        self.latest_solution.clear()
         return_free_memory(design.unknowns)
         before = self.design.indices(design.features[:-1])
         first, new = len(before), slice(len(before), None)
@@ -160,7 +160,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.class_count)
         first = int(whole.group[design.unknowns :].min())
         prior = GaussianPrior(
-            whole.base[design.unknowns :], whole.group[design.unknowns :] - first, whole.sizes[first:], 0
+            whole.unit_precision[design.unknowns :],
+            whole.group[design.unknowns :] - first,
+            whole.sizes[first:],
+            0,
         )
         best = alone.maximise_evidence(prior, (1.0,))
         return best.log_evidence + rest / 2, best.prior.sizes

@@ -86,13 +86,13 @@ class FeatureFit:
     Attributes:
         design: the unknowns.
         posterior: posterior of the unknowns.
-        largest_share: largest allowed effective number of unknowns per value.
+        max_effective_share: largest allowed effective number of unknowns per value.
         held_out_errors: held-out predictions of the folds; None if they were not computed.
     """
 
     design: Design
     posterior: Posterior
-    largest_share: float = _MAX_EFFECTIVE_SHARE
+    max_effective_share: float = _MAX_EFFECTIVE_SHARE
     held_out_errors: HeldOutErrors | None = None
 
     @property
@@ -177,7 +177,10 @@ class FeatureSearch:
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
         if start is not None:
-            noise, prior = start.posterior.noise, design.prior_like(start.design, start.posterior.prior)
+            noise, prior = (
+                start.posterior.noise,
+                design.prior_with_sizes_of(start.design, start.posterior.prior),
+            )
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_sigma_factor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.design import (
@@ -123,7 +123,7 @@ class PositionUncertainty:
             uncertain = self.uncertain_unknowns
             probes = self._probes(JointState.from_measurements(rows))[:, uncertain]
             if (rounded := round_root(root[uncertain], probes, ROUNDING_TOLERANCE)) is not None:
-                kept = CovarianceRoot.from_rounded(rounded.among(uncertain, len(root)))
+                kept = CovarianceRoot.from_rounded(rounded.with_exact_unknowns(uncertain, len(root)))
         return replace(self, covariance_root=kept)
 
     def _probes(self, state: JointState) -> Float64[Tensor, "probes unknowns"]:
@@ -149,7 +149,7 @@ class PositionUncertainty:
         variance: Tensor = self.covariance_root.left_multiply(columns).square().sum(-1)
         if correction is not None:
             joints = columns[..., joint_columns(self.space)] * columns.new_tensor(self.space.robot.directions)
-            unstated = joints @ correction.unstated_root(state)
+            unstated = joints @ correction.unstated_covariance_root(state)
             variance = variance + unstated.square().sum(-1)
         return variance.sqrt()
 
@@ -217,7 +217,7 @@ def position_uncertainty(
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     setup = geometry.setup
     if setup is not None and setup.joint_repeatability and "corner" in value:
-        factor = corner_factor(setup.measurements, value["corner"])
+        factor = corner_sigma_factor(setup.measurements, value["corner"])
         value[JOINT] = factor * setup.joint_repeatability
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

@@ -121,7 +121,7 @@ def show_fleet(
 
 def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     """Print the prior of a fleet: what its robots have in common."""
-    from pisigma.reporting.derived_cards import UNDETERMINED, common_table, spectrum_table
+    from pisigma.reporting.derived_cards import UNDETERMINED, common_error_table, spectrum_table
     from pisigma.reporting.verdict import Verdict, count_text
 
     summary = result.summary
@@ -138,7 +138,9 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
         summary.warnings,
         [table_block("joint correction", *spectrum_table(summary))],
         [
-            table_block(f"parameters that {summary.robots} robots have in common", *common_table(summary)),
+            table_block(
+                f"parameters that {summary.robots} robots have in common", *common_error_table(summary)
+            ),
             sentences("undetermined parameters", [UNDETERMINED]),
         ],
         [f"Model written to {out} in {result.seconds:.1f} s; its README.md has all figures."],

@@ -16,7 +16,7 @@ from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
 from pisigma.deployment.export.urdf import (
     CALIBRATED_FRAME,
     CALIBRATED_TOOL,
-    check_same_geometry,
+    check_same_geometry_as_nominal,
     check_tip,
     missing_meshes,
     updated_urdf_text,
@@ -293,7 +293,9 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
     start = rotation(2, by[0]) @ translation(0.0, 0.0, by[1])
     differences = (drawn.fields.dh - own.fields.dh)[:-1]
     differences[:1, :2] = 0.0
-    check_same_geometry(differences, _SAME, path, "give the MJCF file of this robot, with the same joints")
+    check_same_geometry_as_nominal(
+        differences, _SAME, path, "give the MJCF file of this robot, with the same joints"
+    )
     frames = [there @ inverse(here) for there, here in zip(drawn.frames, own.frames, strict=True)]
     return [drawn.frames[0] @ start @ inverse(own.frames[0]), *frames[1:]]
 

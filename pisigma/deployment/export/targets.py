@@ -243,7 +243,7 @@ def _exported(
     assert request.program is not None
     diff = corrected.diff(scanned.text, (str(request.program), str(request.out)))
     language = LANGUAGES.get(request.program.suffix.lower())
-    reached = len(corrected.statuses) - len(corrected.unreached)
+    reached = len(corrected.statuses) - len(corrected.unreached_lines)
     shift = corrected.largest_shift * 1e3
     return Exported(
         content=corrected.text.encode("latin-1"),
@@ -252,11 +252,11 @@ def _exported(
             "program": str(request.program),
             "targets": len(corrected.statuses),
             "statuses": dict(Counter(status.name.lower() for _, status in corrected.statuses)),
-            "unreached": [
-                {"line": line, "status": status.name.lower()} for line, status in corrected.unreached
+            "unreached_lines": [
+                {"line": line, "status": status.name.lower()} for line, status in corrected.unreached_lines
             ],
             "branches": list(corrected.branches),
-            "way_points": corrected.waypoints,
+            "way_points": corrected.waypoint_count,
             "tolerance_mm": tolerance_mm,
             "largest_shift_mm": shift,
             "left_alone": [{"line": line, "reason": reason} for line, reason in corrected.unchanged_lines],
@@ -270,7 +270,7 @@ def _exported(
             *_warnings(corrected, str(request.program)),
         ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
-        f"and {corrected.waypoints} waypoints",
+        f"and {corrected.waypoint_count} waypoints",
         missed_limit=_shortfall(corrected, str(request.program)),
         leading_text=diff,
     )
@@ -289,10 +289,10 @@ def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
 
 
 def _shortfall(corrected: CorrectedProgram, source: str) -> str | None:
-    if not corrected.unreached:
+    if not corrected.unreached_lines:
         return None
-    line, status = corrected.unreached[0]
-    others = _listed([f"line {n} {s.name.lower()}" for n, s in corrected.unreached[1:]])
+    line, status = corrected.unreached_lines[0]
+    others = _listed([f"line {n} {s.name.lower()}" for n, s in corrected.unreached_lines[1:]])
     also = f" (Also: {others}.)" if others else ""
     return f"{source}, line {line}: {status.name.lower()}, so the line is unchanged. {status.sentence}{also}"
 

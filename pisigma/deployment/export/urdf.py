@@ -218,10 +218,10 @@ def _check_same(described: RobotFields, nominal: Robot, path: str) -> None:
             remedy="give the file that the robot was loaded from, and the same tip",
         )
     remedy = "give the file that the robot was loaded from"
-    check_same_geometry((described.dh - nominal.dh)[:-1], _SAME, path, remedy)
+    check_same_geometry_as_nominal((described.dh - nominal.dh)[:-1], _SAME, path, remedy)
 
 
-def check_same_geometry(
+def check_same_geometry_as_nominal(
     differences: Float64[np.ndarray, "rows parameters"],
     max_difference: float,
     path: str | os.PathLike[str],

@@ -174,7 +174,7 @@ class JsonLines(AbstractProtocol):
         model = self._models.find_model(request.get("model"))
         slow = not model.has_compiled_solver or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
-        names = model.short_name if request.get("brief") else model.full_name
+        names = model.brief_answer_name if request.get("brief") else model.answer_name
         return (lambda: solve(model, request)), slow, names
 
     def _question(self, request: dict[str, Any]) -> tuple[_Job, bool]:
@@ -337,7 +337,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
 
 def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
     near = _joints(model, request, *_NEAR) if request.keys() & _NEAR else None
-    if near is not None and not model.ik.postures.contains(near):
+    if near is not None and not model.ik.plausible_joints.contains(near):
         raise RequestError(
             f"a value is more than a full turn (or 1 m) outside the joint limits of model '{model.name}'",
             option=_NEAR[model.joints_key != "q_deg"],

@@ -63,12 +63,12 @@ class ServedModel:
         return bytes.fromhex(self.sha256)[:8]
 
     @cached_property
-    def full_name(self) -> dict[str, str]:
+    def answer_name(self) -> dict[str, str]:
         """Name of the model in answers."""
         return {"model": self.name}
 
     @cached_property
-    def short_name(self) -> dict[str, str]:
+    def brief_answer_name(self) -> dict[str, str]:
         """Name of the model in brief answers: hexadecimal digits, which a simple parser cannot mistake for a status."""
         return {"sha256": self.short_hash.hex()}
 
@@ -125,7 +125,7 @@ class ServedModel:
             The row of `CompiledIK.solve_packed`.
         """
         values, kernels = self._near.unpack(near), self.byte_solver
-        if kernels is not None and self.ik.postures.contains(values):
+        if kernels is not None and self.ik.plausible_joints.contains(values):
             return kernels.solve_packed(T_base_tool, near)
         none = all(map(math.isnan, values))
         if kernels is not None:

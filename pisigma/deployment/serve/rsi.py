@@ -59,7 +59,7 @@ class RsiCounts:
         unanswered: number of cycles without an answer, because packets were lost or late.
         ignored: number of packets from other senders.
         outside_domain: number of answers outside the domain of the model, where the correction is extrapolated.
-        largest_deg: largest absolute correction [deg].
+        largest_correction_deg: largest absolute correction [deg].
         answer_seconds: times from packet to answer in the last cycles [s].
         slowest_answer: longest time from packet to answer [s].
     """
@@ -68,7 +68,7 @@ class RsiCounts:
     unanswered: int = 0
     ignored: int = 0
     outside_domain: int = 0
-    largest_deg: float = 0.0
+    largest_correction_deg: float = 0.0
     answer_seconds: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_DURATIONS))
     slowest_answer: float = 0.0
 
@@ -79,7 +79,7 @@ class RsiCounts:
         return (
             f"RSI stream ended: {self.answered} cycles answered, {self.unanswered} lost or late, "
             f"{self.outside_domain} outside the domain, {self.ignored} packets of other senders; corrections at "
-            f"most {self.largest_deg:.4f} deg; answers after {p50:.3f} ms (median), {p99:.3f} ms (99 %), "
+            f"most {self.largest_correction_deg:.4f} deg; answers after {p50:.3f} ms (median), {p99:.3f} ms (99 %), "
             f"{self.slowest_answer * 1e3:.3f} ms (maximum)."
         )
 
@@ -134,7 +134,7 @@ class RsiAnswers:
         self._sent = sent
         self.finished = self._leaving and self._weight == 0
         self.counts.answered += 1
-        self.counts.largest_deg = max(self.counts.largest_deg, max(map(abs, sent)))
+        self.counts.largest_correction_deg = max(self.counts.largest_correction_deg, max(map(abs, sent)))
         return (self._form % (*sent, stamp)).encode()
 
     def _cycles_since_last(self, stamp: int) -> int:

@@ -21,7 +21,7 @@ _CERTAIN = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class ArmBefore:
+class RemeasuredArm:
     """An arm as calibrated before and as measured now.
 
     Attributes:
@@ -134,7 +134,7 @@ class MovedBases:
         return tuple(one for one in self.bodies if one.log_likelihood > best - _CERTAIN)
 
 
-def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
+def find_moved_bases(arms: Sequence[RemeasuredArm]) -> MovedBases:
     """Find the arm's base or the frame that was moved since the arms were calibrated.
 
     The current bases are fitted with the arms as calibrated. Errors of an arm shift its base equally before and now, so
@@ -208,7 +208,7 @@ def _joint_covariance(
 
 
 def _if_moved(
-    arms: Sequence[ArmBefore],
+    arms: Sequence[RemeasuredArm],
     owners: Sequence[tuple[int, str]],
     body: tuple[str, str],
     L: Float64[Tensor, "motions motions"],
@@ -247,7 +247,7 @@ def _if_moved(
 
 
 def _origin(
-    arms: Sequence[ArmBefore], owners: Sequence[tuple[int, str]], body: tuple[str, str]
+    arms: Sequence[RemeasuredArm], owners: Sequence[tuple[int, str]], body: tuple[str, str]
 ) -> Float64[Tensor, " 3"]:
     """Return the origin of an arm's base or of a frame in the base of the first arm [m]."""
     kind, name = body

@@ -55,15 +55,15 @@ class JointDifference:
         standard_error: standard error of the difference [rad].
         verdict: "different" if the difference is significant and larger than the tolerance, "same" if it is smaller
             than the tolerance with a confidence of 97.5 %, otherwise "unknown", which more rows would decide.
-        moved: the arm whose zero moved, if the joint is different; "both" if the measured positions of an arm exclude
-            that only one zero moved, "unknown" if they do not show which zero moved.
+        moved_arm: the arm whose zero moved, if the joint is different; "both" if the measured positions of an arm
+            exclude that only one zero moved, "unknown" if they do not show which zero moved.
     """
 
     joint: str
     value: float
     standard_error: float
     verdict: Verdict
-    moved: Moved | None
+    moved_arm: Moved | None
 
 
 def estimate_zero_changes(

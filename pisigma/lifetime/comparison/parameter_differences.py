@@ -37,8 +37,9 @@ class ParameterDifference:
         shift: estimated difference given the significant differences, with base and tool free if these are fitted; None
             without posteriors, or if the parameter moves the tool in the same way as those parameters.
         sigma: standard deviation of the shift.
-        p: probability of a shift at least this large by chance, times the number of tested parameters (Bonferroni).
-        equivalent: names of parameters with the same effect on the tool.
+        p_value: probability of a shift at least this large by chance, times the number of tested parameters
+            (Bonferroni).
+        equivalent_parameters: names of parameters with the same effect on the tool.
     """
 
     name: str
@@ -48,8 +49,8 @@ class ParameterDifference:
     sigmas: tuple[float | None, float | None]
     shift: float | None = None
     sigma: float | None = None
-    p: float | None = None
-    equivalent: tuple[str, ...] = ()
+    p_value: float | None = None
+    equivalent_parameters: tuple[str, ...] = ()
 
     @property
     def difference(self) -> float:
@@ -63,11 +64,11 @@ class Remainder:
     """Test of the displacement that base, tool and the significant parameters do not explain.
 
     Attributes:
-        p: probability of a displacement at least this large by chance.
+        p_value: probability of a displacement at least this large by chance.
         significant: whether p is below the significance level.
     """
 
-    p: float
+    p_value: float
     significant: bool
 
 
@@ -141,8 +142,8 @@ def _tested(
         parameter,
         shift=shift * factor,
         sigma=deviation * factor,
-        p=min(chance, 1.0),
-        equivalent=tuple(parameters[one].name for one in alike if one < len(parameters)),
+        p_value=min(chance, 1.0),
+        equivalent_parameters=tuple(parameters[one].name for one in alike if one < len(parameters)),
     )
 
 

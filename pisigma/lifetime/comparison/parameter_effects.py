@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.lifetime.comparison.model_pair import ModelPair, frames_of
-from pisigma.lifetime.recalibration.movement import Movement, deviation_along
+from pisigma.lifetime.recalibration.movement import Movement, sigma_along
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
@@ -41,21 +41,25 @@ class Difference:
 
     Attributes:
         shift: difference with its name, such as "joint 3" or "a_2"; a joint zero counts in the joint's direction.
-        equivalent: names of parameters with the same effect on the tool, which may differ instead.
+        equivalent_parameters: names of parameters with the same effect on the tool, which may differ instead.
     """
 
     shift: Movement
-    equivalent: tuple[str, ...]
+    equivalent_parameters: tuple[str, ...]
 
     @property
     def sentence(self) -> str:
         """Clause, such as "joint 3 by 0.25 ± 0.01 deg"."""
-        alike = f" (or, equivalently, {' or '.join(self.equivalent)})" if self.equivalent else ""
+        alike = (
+            f" (or, equivalently, {' or '.join(self.equivalent_parameters)})"
+            if self.equivalent_parameters
+            else ""
+        )
         return f"{self.shift.what}{alike} by {self.shift.size}"
 
     def to_json(self) -> dict[str, object]:
         """Return plain values; see `Movement.to_json`."""
-        return {**self.shift.to_json(), "equivalent": list(self.equivalent)}
+        return {**self.shift.to_json(), "equivalent": list(self.equivalent_parameters)}
 
 
 class ParameterEffects:
@@ -211,7 +215,7 @@ class ParameterEffects:
             length = now + step[:3] - was
             angle = rotation_vector(rotation_from_vector(step[3:]) @ R.t())
             moved += [
-                Movement(what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
+                Movement(what, float(vector.norm()) * factor, sigma_along(vector, block) * factor, unit)
                 for vector, block, (unit, factor) in (
                     (length, C[:3, :3], SHOWN_UNITS["m"]),
                     (angle, C[3:, 3:], SHOWN_UNITS["rad"]),

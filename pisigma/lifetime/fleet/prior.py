@@ -237,13 +237,13 @@ class FleetConsistency:
 
     Attributes:
         probability: probability that a robot of the fleet is at least as far from its mean.
-        gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
+        log_evidence_gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
         class_share: multiple of the covariance of its class which, added to that of the fleet, makes its rows most
             probable; a robot unlike the others would otherwise get the small predicted errors of the fleet.
     """
 
     probability: float
-    gain: float
+    log_evidence_gain: float
     class_share: float
 
     @staticmethod
@@ -288,7 +288,7 @@ class FleetConsistency:
     @property
     def is_inconsistent(self) -> bool:
         """Whether the robot is inconsistent with the fleet, and the robot's class explains the rows better."""
-        return self.probability < FALSE_ALARM and self.gain < 0
+        return self.probability < FALSE_ALARM and self.log_evidence_gain < 0
 
     @property
     def sentence(self) -> str:

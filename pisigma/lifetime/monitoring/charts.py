@@ -207,17 +207,17 @@ class SeriesChange:
     """A change in a series of values.
 
     Attributes:
-        number: index of the first value after the change.
+        first_index: index of the first value after the change.
         is_single: whether only this value is changed, rather than also all later values.
     """
 
-    number: int
+    first_index: int
     is_single: bool
 
     def column(self, count: int) -> Float64[Tensor, " count"]:
         """Return the column of the event: 1 for changed values, 0 for other values."""
         order = torch.arange(count)
-        return (order == self.number if self.is_single else order >= self.number).double()
+        return (order == self.first_index if self.is_single else order >= self.first_index).double()
 
 
 @dataclass(frozen=True, eq=False)

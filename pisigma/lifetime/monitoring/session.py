@@ -288,7 +288,7 @@ def _explained(
     every = SessionEvidence(values, problem.covariance_root, standing, movement_hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[_Solved]:
-        evidence = every.with_wrong(wrong)
+        evidence = every.with_wrong_rows(wrong)
         there, explanation = evidence.values, evidence.compare_hypotheses()
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
@@ -331,7 +331,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
         rms_after=rms_after * optimism,
         rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
         score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
-        error_score=evidence.with_moved(solved.moved_frames).error_score(),
+        error_score=evidence.with_moved_groups(solved.moved_frames).error_score(),
         values=len(solved.values.y),
         relocated_frames=tuple(" ".join(owner).strip() for owner in relocated),
         observable=tuple(
@@ -368,7 +368,10 @@ def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement,
 
 def _zeros(solved: _Solved) -> JointZeros:
     """Estimate the zeros of all joints together."""
-    evidence, noise_factor = solved.evidence.with_moved(solved.moved_frames), solved.explanation.noise_factor
+    evidence, noise_factor = (
+        solved.evidence.with_moved_groups(solved.moved_frames),
+        solved.explanation.noise_factor,
+    )
     shift, covariance = evidence.estimate_shift(_joints(solved), noise_factor)
     sensitivity, session_covariance = evidence.sensitivity_and_covariance(_joints(solved), noise_factor)
     return JointZeros(shift, covariance.diagonal().sqrt(), sensitivity, session_covariance)

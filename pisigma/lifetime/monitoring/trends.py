@@ -209,11 +209,12 @@ def jumps_of(joints: Sequence[Row], records: Sequence[Record]) -> tuple[Jump, ..
         unit, factor = SHOWN_UNITS["rad" if joint.type == "revolute" else "m"]
         sizes, deviations = (those[-len(zero.events) :] for those in zero.fit(zero.drifts))
         for event, size, deviation in sorted(
-            zip(zero.events, sizes, deviations, strict=True), key=lambda one: one[0].number
+            zip(zero.events, sizes, deviations, strict=True), key=lambda one: one[0].first_index
         ):
             if abs(size) > CLEAR * deviation:
                 before, after = (
-                    records[zero.sessions[number]].date for number in (event.number - 1, event.number)
+                    records[zero.sessions[number]].date
+                    for number in (event.first_index - 1, event.first_index)
                 )
                 what, sizes_of = f"joint {number}", (size * factor, deviation * factor)
                 jumps.append(Jump(what, unit, *sizes_of, before, after, event.is_single))

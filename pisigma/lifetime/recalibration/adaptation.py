@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.prediction import predicted_poses
-from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_sigma_factor
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, stated_sigmas
@@ -100,7 +100,7 @@ class Adaptation:
     @cached_property
     def covariance_root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
-        root = torch.cat([self.update.covariance_root(), self.problem.fixed_root], 1)
+        root = torch.cat([self.update.covariance_root(), self.problem.held_covariance_root], 1)
         active = self.problem.design.active_count
         return torch.cat([self.problem.coordinate_change @ root[:active], root[active:]])
 
@@ -111,7 +111,9 @@ class Adaptation:
         value = {sensor.name: sigma for sensor, sigma in zip(sensors, self.drift.noise.tolist(), strict=True)}
         setup = self.problem.setup
         if setup.joint_repeatability and "corner" in value:
-            value[JOINT] = setup.joint_repeatability * corner_factor(setup.measurements, value["corner"])
+            value[JOINT] = setup.joint_repeatability * corner_sigma_factor(
+                setup.measurements, value["corner"]
+            )
         return CalibrationNoise(value, stated_sigmas(sensors))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:

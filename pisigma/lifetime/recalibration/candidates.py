@@ -29,7 +29,7 @@ from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.model.training_rows import stored_training_rows
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows_diagnostic
 from pisigma.validation.gate import check_rows
@@ -325,7 +325,7 @@ def _large_errors(
     parent: CalibratedModel, judged: CandidateChoice, adaptation: Adaptation
 ) -> tuple[Diagnostic, ...]:
     """Return a finding if no candidate predicts the held-out rows."""
-    error, share = judged.rms[judged.kept], plausible_share(parent.robot)
+    error, share = judged.rms[judged.kept], plausible_error_per_reach(parent.robot)
     if error is None:
         return ()
     noise = (

@@ -15,14 +15,14 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import ChangeLimits, RobotClass, plausible_share
+from pisigma.robot.robot_class import ChangeLimits, RobotClass, plausible_error_per_reach
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows_diagnostic
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.setup_faults.cause import join_words, length_text
 from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, measured_rows
-from pisigma.validation.setup_faults.setup_faults import judged_values
+from pisigma.validation.setup_faults.setup_faults import without_unknown_orientation
 
 _MAX_ROWS = 60
 """Largest number of rows that are used, because the covariance of all their values is needed."""
@@ -44,7 +44,7 @@ def find_motion(
     """
     with suppress(IdentificationError, ModelError):
         posterior = ModelPosterior.from_model(model)
-        some = judged_values(model, rows)
+        some = without_unknown_orientation(model, rows)
         if rows.position is not None:
             some = replace(
                 some.select(evenly_spaced_rows(measured_rows(rows), _MAX_ROWS)), pair=None, distance=None
@@ -71,7 +71,7 @@ def session_diagnostics(
     if len(session.outliers) > MIN_WRONG_SHARE * rows.rows:
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
         return (too_many_wrong_rows_diagnostic(rows, torch.tensor(wrong)),)
-    limit = plausible_share(model.robot) * model.robot.reach
+    limit = plausible_error_per_reach(model.robot) * model.robot.reach
     if session.rms_after > limit:
         sentence = (
             f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement reduces it to less than "

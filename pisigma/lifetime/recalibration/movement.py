@@ -187,10 +187,10 @@ def _of_frame(
         motion = torch.cat([new[:3, 3] - old[:3, 3], turn])
         if kind == "base":
             motion = (
-                motion.view(2, 3) @ problem.setup.anchors.bases[space.frames.index(name), :3, :3]
+                motion.view(2, 3) @ problem.setup.reference_frames.bases[space.frames.index(name), :3, :3]
             ).flatten()
     return [
-        Movement(group.what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
+        Movement(group.what, float(vector.norm()) * factor, sigma_along(vector, block) * factor, unit)
         for vector, block, (unit, factor) in (
             (motion[:3], covariance[:3, :3], SHOWN_UNITS["m"]),
             (motion[3:], covariance[3:, 3:], SHOWN_UNITS["rad"]),
@@ -198,7 +198,7 @@ def _of_frame(
     ]
 
 
-def deviation_along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
+def sigma_along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
     """Compute the standard deviation along a vector; the largest of all directions if the vector is 0."""
     length = float(vector.norm())
     if length > 0.0:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
-from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_sigma_factor
 from pisigma.calibration.geometric.problem.parameters import LENGTHS, ParameterSpace
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
@@ -74,7 +74,7 @@ class RecalibrationProblem:
         coordinate_change: derivative of the parameters in the user's coordinates with respect to the problem's
             parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
-        fixed_root: root of the covariance of unknowns that are held fixed.
+        held_covariance_root: root of the covariance of unknowns that are held fixed.
     """
 
     posterior: ModelPosterior
@@ -84,7 +84,7 @@ class RecalibrationProblem:
     covariance_root: Float64[Tensor, "unknowns directions"]
     coordinate_change: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
-    fixed_root: Float64[Tensor, "unknowns _directions"]
+    held_covariance_root: Float64[Tensor, "unknowns _directions"]
 
     @cached_property
     def configuration(self) -> Int64[Tensor, " rows"]:
@@ -101,7 +101,10 @@ class RecalibrationProblem:
         """Return the problem with the arm held fixed, in which only moved bases and tools are unknown."""
         relocated = tuple(group for group in self.groups if group.fixed_size)
         return replace(
-            self, covariance_root=self.fixed_root, groups=relocated, fixed_root=self.covariance_root
+            self,
+            covariance_root=self.held_covariance_root,
+            groups=relocated,
+            held_covariance_root=self.covariance_root,
         )
 
 
@@ -139,7 +142,7 @@ def recalibration_problem(
         (len(start) + len(posterior.weights), posterior.covariance_root.shape[1])
     )
     parameters = len(posterior.space.parameters)
-    root[posterior.positions_in(space)] = posterior.covariance_root[:parameters]
+    root[posterior.parameter_indices_in(space)] = posterior.covariance_root[:parameters]
     for group, name in new & known:
         # The posterior does not apply to a frame that was moved; a wide drift group replaces it.
         root[frame_slice(space, group, name)] = 0.0
@@ -156,7 +159,7 @@ def _joint_repeatability(posterior: ModelPosterior, rows: Measurements) -> float
     """Return the repeatability of the joints [rad] relative to the deviations that rows of images state."""
     known = posterior.noise.value
     if "corner" in rows.kinds and JOINT in known:
-        return known[JOINT] / corner_factor(rows, known["corner"])
+        return known[JOINT] / corner_sigma_factor(rows, known["corner"])
     return RobotClass.from_robot(posterior.space.robot).joint_repeatability
 
 

@@ -56,10 +56,10 @@ def read_corners(path: str | os.PathLike[str], robot: Robot, cameras: CameraFile
     table = read_table(path)
     if not set(CORNERS) & set(table.header):
         return Measurements.read_csv(path, robot)
-    return corners_of(table, robot, cameras)
+    return measurements_of_corners(table, robot, cameras)
 
 
-def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
+def measurements_of_corners(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
     """Convert rows of a file of corners to measurements; see `read_corners`."""
     cameras = _by_name(Camera.load, files.cameras, "camera")
     boards = _by_name(Board.load, files.boards, "board")

@@ -105,7 +105,7 @@ def check_complete(mapping: FileMapping) -> None:
             at=header,
             remedy="add the missing column, or omit the rotation with --rotation none",
         )
-    if lacking := mapping.without_unit:
+    if lacking := mapping.columns_without_unit:
         names, many = ", ".join(f"'{one.heading}'" for one in lacking), "s" if len(lacking) > 1 else ""
         likely = mapping.likely_units
         first = next(

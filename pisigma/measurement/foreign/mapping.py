@@ -82,14 +82,14 @@ class FileMapping:
         return column.heading if self.file.headings.count(column.heading) == 1 else str(column.index + 1)
 
     @property
-    def without_unit(self) -> tuple[MappedColumn, ...]:
+    def columns_without_unit(self) -> tuple[MappedColumn, ...]:
         """Columns whose unit is unknown; times without a unit are in seconds."""
         return tuple(one for one in self.columns if one.target.missing_unit_kind not in (None, "time"))
 
     @property
     def likely_units(self) -> dict[UnitKind, str]:
         """Likely units of the columns without a unit, by kind of unit."""
-        kinds = {one.target.missing_unit_kind for one in self.without_unit}
+        kinds = {one.target.missing_unit_kind for one in self.columns_without_unit}
         small_angles = is_unit_certain("rad", largest_value(self.file, joint_columns(self.columns)))
         length = (
             "m" if is_unit_certain("m", largest_value(self.file, position_columns(self.columns))) else "mm"

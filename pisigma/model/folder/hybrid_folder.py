@@ -328,7 +328,7 @@ def _root(
         rounded = RoundedRoot.unpacked(content, rows)
     except ValueError as problem:
         raise MisfitError(str(problem), file=WEIGHTS, value="uncertainty.numbers") from None
-    return CovarianceRoot.from_rounded(rounded.among(uncertain, count))
+    return CovarianceRoot.from_rounded(rounded.with_exact_unknowns(uncertain, count))
 
 
 def _unknowns_section(group: UnknownGroup) -> dict[str, object]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pisigma.files.errors import ModelError, Place, PoseError
 from pisigma.files.model_files import COMPILED, compiled_model_hash, model_hash
-from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
+from pisigma.model.inverse.joint_input import PlausibleJoints, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import call_model, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
@@ -116,9 +116,9 @@ class CorrectedIK(AbstractInverse):
             return None
 
     @cached_property
-    def postures(self) -> Postures:
+    def plausible_joints(self) -> PlausibleJoints:
         """Ranges of plausible joint values, in which `near` must lie."""
-        return Postures(self.limits, self.revolute, self.joints)
+        return PlausibleJoints(self.limits, self.revolute, self.joints)
 
     def __call__(
         self,
@@ -160,7 +160,7 @@ class CorrectedIK(AbstractInverse):
         task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         axes = task.task_axes
         if near is not None:
-            near = self.postures.check_near(near, throw)
+            near = self.plausible_joints.check_near(near, throw)
         approach = checked_approach(approach)
         if task.controller is not None:
             return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)

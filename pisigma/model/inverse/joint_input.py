@@ -150,7 +150,7 @@ def checked_approach(approach: Any) -> Any:
     return values
 
 
-class Postures:
+class PlausibleJoints:
     """Joint values that are plausible for a robot: at most one turn beyond the joint limits.
 
     For prismatic joints, the margin is the stroke, but at least 1 m. Solutions, and a real robot, may be somewhat

@@ -96,7 +96,7 @@ def follow_path(
         )
     if branch is not None:
         check_choice(PoseError, "branch", branch, ik.branches)
-    near_rows = None if near is None else np.asarray(ik.postures.check_near(near), dtype=np.float64)
+    near_rows = None if near is None else np.asarray(ik.plausible_joints.check_near(near), dtype=np.float64)
     on_branches = ik.closed_form and len(ik.joints) <= ik.task_axes.free.count(False)
     guide = _guide(ik, T, near_rows, branch) if on_branches else _one_by_one(ik, T, near_rows)
     solution = _solve(ik, T, guide, _approaches(guide, near_rows))
@@ -110,7 +110,7 @@ def _solve(
     approach: Array | None = None,
 ) -> Any:
     """Solve poses near joint values, which may belong to a solution far outside the joint limits."""
-    return ik(T, near=None if near is None else ik.postures.clip(near), approach=approach)
+    return ik(T, near=None if near is None else ik.plausible_joints.clip(near), approach=approach)
 
 
 def _approaches(q: Array, near: Array | None) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.model.inverse.joint_input import Postures
+from pisigma.model.inverse.joint_input import PlausibleJoints
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
@@ -44,7 +44,7 @@ class AbstractInverse(ABC):
 
     @property
     @abstractmethod
-    def postures(self) -> Postures:
+    def plausible_joints(self) -> PlausibleJoints:
         """Ranges of plausible joint values, in which `near` must lie."""
 
     @abstractmethod

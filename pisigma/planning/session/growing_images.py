@@ -7,7 +7,7 @@ import torch
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.measurement.camera.corner_file import corners_of
+from pisigma.measurement.camera.corner_file import measurements_of_corners
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.faults import Fault
@@ -54,7 +54,7 @@ class ImageReader:
         key = repr((image.lines[0], image.records))
         if key not in self._read:
             try:
-                self._read[key] = corners_of(image, self._robot, self._files)
+                self._read[key] = measurements_of_corners(image, self._robot, self._files)
             except MeasurementError as problem:
                 self._read[key] = _left_out(problem, image)
         return self._read[key]

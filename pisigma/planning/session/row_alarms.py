@@ -43,7 +43,7 @@ def withdrawn_alarm(line: int) -> Alarm:
     return Alarm(line, "cleared", text, repeat=False, counts=True)
 
 
-def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
+def stale_reading_alarms(rows: Measurements, start: int) -> Iterator[Alarm]:
     """Yield alarms about rows from `start` that repeat readings of an earlier row: duplicates, or a frozen sensor."""
     fields = rows.as_fields().numbers.values()
     numbers = torch.cat([values.reshape(rows.rows, -1) for values in fields], 1)
@@ -67,7 +67,7 @@ def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
             yield Alarm(here, "frozen", text, repeat=True)
 
 
-def other_joint_values(
+def unplanned_joint_alarms(
     robot: Robot,
     rows: Measurements,
     start: int,

@@ -110,7 +110,7 @@ class RowModel:
         sigma: float | None,
         kept: Bool[Tensor, " rows"],
         earlier: "RowModel | None" = None,
-        of_kept: "RowModel | None" = None,
+        kept_model: "RowModel | None" = None,
     ) -> "RowModel":
         """Return the model linearised at the base and tool that fit the kept rows.
 
@@ -120,7 +120,7 @@ class RowModel:
             sigma: standard deviation of measured lengths if the rows state none [m]; None for `_USUAL_NOISE`.
             kept: rows to which base and tool are fitted.
             earlier: a model of the same rows, whose setup is used again; None to make one.
-            of_kept: the model of the kept rows alone; None to make it.
+            kept_model: the model of the kept rows alone; None to make it.
 
         Raises:
             IdentificationError: there are too few rows for base and tool.
@@ -129,8 +129,8 @@ class RowModel:
         setup, design = _problem(robot, rows) if earlier is None else (earlier.setup, earlier.design)
         point, rounds = setup.start, LINEARISATIONS
         if not bool(kept.all()):
-            of_kept = of_kept or RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])
-            point, rounds = _start_at(setup, of_kept.geometry), 1
+            kept_model = kept_model or RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])
+            point, rounds = _start_at(setup, kept_model.geometry), 1
         values = sensor_values(setup.problem, point)
         columns = torch.cat([design.columns(one, slice(None)).flatten(0, 1) for one in values])
         weights = columns[:, design.active_count :]
@@ -214,7 +214,7 @@ class RowModel:
                 block = torch.linalg.solve(sensor.weight.permute(2, 0, 1)[one.row], block[..., None])[..., 0]
                 length[one.row], angle[one.row] = block[:, :3].norm(dim=1), block[:, 3:].norm(dim=1)
             if sensor.name in ("position", "corner"):
-                frames = self.setup.anchors.bases[self.setup.problem.frame[one.row], :3, :3]
+                frames = self.setup.reference_frames.bases[self.setup.problem.frame[one.row], :3, :3]
                 position[one.row] = (frames @ block[:, :3, None])[..., 0]
         return length, angle, position
 
@@ -286,11 +286,11 @@ def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[
     for number, frame in enumerate(setup.problem.space.frames):
         if frame in geometry.bases:
             T = transform_from_xyzrpy(torch.from_numpy(geometry.bases[frame]))
-            bases[number] = xyzrpy_from_transform(invert(setup.anchors.bases[number]) @ T)
+            bases[number] = xyzrpy_from_transform(invert(setup.reference_frames.bases[number]) @ T)
     for number, target in enumerate(setup.problem.space.targets):
         if target in geometry.tools:
             tool = torch.from_numpy(geometry.tools[target])
-            R = rotation_from_rpy(tool[3:]) @ setup.anchors.tools[number].mT
+            R = rotation_from_rpy(tool[3:]) @ setup.reference_frames.tools[number].mT
             tools[number] = torch.cat([tool[:3], rpy_from_rotation(R)])
     point = setup.start.clone()
     for name, block in (("base", bases), ("tool", tools)):

@@ -21,8 +21,8 @@ from pisigma.planning.session.row_alarms import (
     contradiction_alarm,
     is_wrong,
     joint_differences,
-    other_joint_values,
-    stale_readings,
+    stale_reading_alarms,
+    unplanned_joint_alarms,
     unreadable_alarm,
     withdrawn_alarm,
 )
@@ -102,10 +102,10 @@ class SessionRows:
         if new is not None and new.rows:
             start = 0 if self.rows is None else self.rows.rows
             self.rows = rows = new if self.rows is None else with_common_noise(join([self.rows, new]))
-            stale = list(stale_readings(rows, start))
+            stale = list(stale_reading_alarms(rows, start))
             copies = {alarm.line for alarm in stale}
             usable = torch.tensor([line not in copies for line in rows.line[start:]])
-            remarks = other_joint_values(self._robot, rows, start, planned, names)
+            remarks = unplanned_joint_alarms(self._robot, rows, start, planned, names)
             alarms += [*stale, *(alarm for alarm in remarks if alarm.line not in copies)]
             self.usable = torch.cat([self.usable, usable])
             changed = self._judge(rows, planned, names)

@@ -35,7 +35,12 @@ from pisigma.validation.report.corrections import (
     correction_curves,
     parameter_correlations,
 )
-from pisigma.validation.report.dependence import Dependence, ErrorsByName, dependences, group_errors_by_name
+from pisigma.validation.report.dependence import (
+    Dependence,
+    ErrorsByFrameOrTarget,
+    dependences,
+    group_errors_by_name,
+)
 from pisigma.validation.report.error_map import ErrorMap, largest_errors, map_of_rows, map_of_workspace
 
 _WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
@@ -177,8 +182,8 @@ class ReportContent:
     remarks: tuple[str, ...]
     map: ErrorMap
     dependences: tuple[Dependence, ...]
-    frames: ErrorsByName
-    targets: ErrorsByName
+    frames: ErrorsByFrameOrTarget
+    targets: ErrorsByFrameOrTarget
     correlations: ParameterCorrelations
     curves: tuple[CorrectionCurve, ...]
     learned: tuple[str, ...]
@@ -277,8 +282,12 @@ def report_content(
         remarks=remarks,
         map=map_of_workspace(model) if rows is None else map_of_rows(model, rows),
         dependences=() if rows is None else dependences(rows, model.robot),
-        frames=ErrorsByName() if rows is None else group_errors_by_name(rows, rows.measurements.frame),
-        targets=ErrorsByName() if rows is None else group_errors_by_name(rows, rows.measurements.target),
+        frames=ErrorsByFrameOrTarget()
+        if rows is None
+        else group_errors_by_name(rows, rows.measurements.frame),
+        targets=ErrorsByFrameOrTarget()
+        if rows is None
+        else group_errors_by_name(rows, rows.measurements.target),
         correlations=correlations,
         curves=correction_curves(model),
         learned=_learned(summary),

@@ -15,7 +15,7 @@ from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.report.accuracy import DOMINANT_SHARE, Accuracy, AccuracyLimit, RowOrigin
 from pisigma.validation.report.arm_in_images import ArmInImages
 from pisigma.validation.report.corrections import CorrectionCurve, joint_gaps, outside_errors
-from pisigma.validation.report.dependence import Dependence, ErrorsByName
+from pisigma.validation.report.dependence import Dependence, ErrorsByFrameOrTarget
 from pisigma.validation.report.error_map import ErrorMap, Layer, Quantity
 
 MODEL_LABELS = {
@@ -64,7 +64,7 @@ def dependence_text(dependence: Dependence) -> str:
     return " ".join(say("dependence", dependence, dependence.test))
 
 
-def names_text(errors: ErrorsByName) -> str:
+def frame_or_target_text(errors: ErrorsByFrameOrTarget) -> str:
     """Return a sentence on whether errors differ between frames or targets."""
     return say("by_name", errors)[0]
 

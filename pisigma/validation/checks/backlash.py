@@ -75,7 +75,7 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
     return best
 
 
-def with_sides_of_order(
+def with_approach_by_order(
     calibrator: GeometricCalibrator,
     rows: Measurements,
     select_rows: Callable[[Measurements], Measurements] = lambda rows: rows,

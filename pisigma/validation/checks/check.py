@@ -27,7 +27,7 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_fram
 from pisigma.validation.held_out.trained_calibrations import Result, geometric_result
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 from pisigma.validation.setup_faults.setup_fault import SetupFault
-from pisigma.validation.setup_faults.setup_faults import find_setup_faults, judged_values
+from pisigma.validation.setup_faults.setup_faults import find_setup_faults, without_unknown_orientation
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class RowsUnderModel:
         if rows.position is None:
             return None
         kinds = kinds_to_fit(model, rows, fitted)
-        some = judged_values(model, rows)
+        some = without_unknown_orientation(model, rows)
         T = poses_of_rows(model, with_known_names(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
         if int(there.sum()) < MIN_POSITION_ROWS:

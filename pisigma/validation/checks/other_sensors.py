@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import MIN_TURN
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.robot.se3 import transform
 from pisigma.validation.checks.check import LARGE_SHARE, MIN_POSITION_ROWS, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -87,7 +87,7 @@ def diagnose_lengths(
     ):
         return (), ()
     known, reach = with_known_names(model, rows, kinds), model.robot.reach
-    limit = plausible_share(model.robot) * reach
+    limit = plausible_error_per_reach(model.robot) * reach
     with suppress(IdentificationError):
         errors = _errors(model, known)
         if (

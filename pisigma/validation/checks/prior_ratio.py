@@ -96,7 +96,7 @@ def predicts_held_out_rows(checked: CheckedCalibration) -> bool:
     if errors is None:
         return False
     if validation is None:
-        values = sum(checked.geometric.solved.problem.values_measured)
+        values = sum(checked.geometric.solved.problem.measured_value_counts)
         spare = values - len(checked.geometric.solved.problem.active)
         errors *= math.sqrt(values / spare) if spare > 0 else math.inf
     return errors < PREDICTED_SHARE * figures.nominal.rms_mm and (

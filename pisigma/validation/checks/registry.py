@@ -3,7 +3,7 @@
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ImplausibleError
 from pisigma.measurement.dataset import Measurements
-from pisigma.validation.checks.backlash import with_sides_of_order
+from pisigma.validation.checks.backlash import with_approach_by_order
 from pisigma.validation.checks.camera import check_camera
 from pisigma.validation.checks.check import Check, CheckedCalibration, RowCheck
 from pisigma.validation.checks.lag import check_lag
@@ -73,7 +73,7 @@ def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> 
     try:
         results = fit_compared_calibrations(calibrator, rows)
         unstated = geometric_result(results["geometric"])
-        rows, backlash = with_sides_of_order(calibrator, rows, result=unstated)
+        rows, backlash = with_approach_by_order(calibrator, rows, result=unstated)
         if backlash:
             results = fit_compared_calibrations(calibrator, rows)
     except ImplausibleError:

@@ -21,7 +21,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
     are_unrelated,
     find_nominal_robot_faults,
     largest_group,
-    largest_zero,
+    largest_zero_sigma,
     usual_error,
 )
 from pisigma.validation.setup_faults.setup_fault import combine_alternatives, fault_of_cause
@@ -56,7 +56,9 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
     """Return findings about setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
         fault = combine_alternatives(faults)
-        severity: Severity = "implausible" if fault.largest_zero_shift > largest_zero(robot) else "warning"
+        severity: Severity = (
+            "implausible" if fault.largest_zero_shift > largest_zero_sigma(robot) else "warning"
+        )
         return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
         return (

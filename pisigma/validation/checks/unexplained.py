@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base_and_tool
-from pisigma.robot.robot_class import SERVO, plausible_share
+from pisigma.robot.robot_class import SERVO, plausible_error_per_reach
 from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -71,7 +71,7 @@ MAX_STEP = 0.3
 
 def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
-    limit = plausible_share(judged.model.robot) * judged.model.robot.reach
+    limit = plausible_error_per_reach(judged.model.robot) * judged.model.robot.reach
     if judged.has_large_errors and not judged.setup_faults and not _can_fit(judged, limit):
         yield unexplained_diagnostic(judged.model)
 
@@ -107,12 +107,12 @@ the variance. For a healthy robot the ratio is below 0.01."""
 def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the residuals of every sensor with the robot's reach, and those of positions with the positions' spread.
 
-    Half of the measured lengths must be within `plausible_share` of the reach per axis, 1 % of most robots, and half of
-    the measured angles within as many radians, which move a point at the distance of the reach equally far. No
-    calibration error exceeds these limits.
+    Half of the measured lengths must be within `plausible_error_per_reach` of the reach per axis, 1 % of most robots,
+    and half of the measured angles within as many radians, which move a point at the distance of the reach equally far.
+    No calibration error exceeds these limits.
     """
     robot, by_images = checked.robot, "corner" in checked.rows.kinds
-    share = plausible_share(robot)
+    share = plausible_error_per_reach(robot)
     rows = "images and joint values" if by_images else "rows and positions"
     for sensor, errors in checked.final_errors.items():
         typical = _typical(errors)

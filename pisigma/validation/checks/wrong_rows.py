@@ -9,13 +9,13 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.checks.check import RowsUnderModel
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.setup_faults.cause import length_text
-from pisigma.validation.setup_faults.explanations import plausible_turn
+from pisigma.validation.setup_faults.explanations import plausible_orientation_error
 
 FAR = 10.0
 """Ratio of an error to the median error above which a row is wrong, if the error is also larger than that of any
@@ -102,7 +102,7 @@ def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] |
     if int(there.sum()) < _MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to these rows
         return None
     far = lengths > max(
-        FAR * float(lengths[there].median()), plausible_share(model.robot) * model.robot.reach
+        FAR * float(lengths[there].median()), plausible_error_per_reach(model.robot) * model.robot.reach
     )
     return {row: length_text(float(lengths[row])) for row in far.nonzero()[:, 0].tolist()}
 
@@ -141,14 +141,16 @@ def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[T
     """Return the mask of the rows that are far off, and a text with the error of every row."""
     lengths = judged.error_lengths(T)
     robot = judged.model.robot
-    far = lengths > max(FAR * float(lengths.median()), plausible_share(robot) * robot.reach)
+    far = lengths > max(FAR * float(lengths.median()), plausible_error_per_reach(robot) * robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]
     turned = judged.measured.has_rotation
     if int(turned.sum()) >= _MIN_ROWS:
         angles = _angles(judged, T)
         typical = float(angles[turned].median())
-        if typical <= plausible_turn(robot):  # otherwise the tool's orientation is unknown to the model
-            far = far | (turned & (angles > max(FAR * typical, plausible_turn(robot))))
+        if typical <= plausible_orientation_error(
+            robot
+        ):  # otherwise the tool's orientation is unknown to the model
+            far = far | (turned & (angles > max(FAR * typical, plausible_orientation_error(robot))))
             degrees = torch.rad2deg(angles).tolist()
             texts = [
                 f"{text} and {degree:.3g} deg" if has else text

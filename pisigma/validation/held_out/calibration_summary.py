@@ -263,7 +263,7 @@ def summarise(result: Result) -> CalibrationSummary:
         result: geometric or hybrid calibration.
     """
     geometric = geometric_result(result)
-    exact, pairwise = geometric.redundancy, geometric.pairwise
+    exact, pairwise = geometric.redundancy, geometric.pairwise_redundancy
     summary = CalibrationSummary(
         status=geometric.status.value,
         iterations=geometric.iterations,

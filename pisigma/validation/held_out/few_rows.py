@@ -76,7 +76,7 @@ def _helps(
     calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements, progress: Progress
 ) -> bool:
     """Return whether there are enough values per parameter, or if not, whether a fit predicts held-out poses better."""
-    ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
+    ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated_count, 1)
     if ratio >= _MIN_RATIO:
         return True
     if any(noise.effective_parameters > _USED_UP * noise.values for noise in result.noise):

@@ -91,7 +91,7 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
         fit: the fit.
         arm_variance: variance of every coordinate due to the uncertainty of the arm [m² or rad²].
     """
-    lost, variances = fit.undetermined, fit.covariance.diagonal()
+    lost, variances = fit.undetermined_indices, fit.covariance.diagonal()
     figures = []
     for number, (parameter, before, estimate) in enumerate(
         zip(fit.parameters, fit.previous_values, fit.estimates, strict=True)

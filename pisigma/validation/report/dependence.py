@@ -36,13 +36,13 @@ class BinTest:
     """Result of the Kruskal-Wallis test of differences of errors between bins of a joint's values.
 
     Attributes:
-        p: probability of such differences by chance.
+        p_value: probability of such differences by chance.
         low: smallest RMS error of a bin.
         high: largest RMS error of a bin, in the unit of the errors.
         worst_bin_edges: joint values that bound the bin with the largest RMS error, in the unit of the joint.
     """
 
-    p: float
+    p_value: float
     low: float
     high: float
     worst_bin_edges: tuple[float, float]
@@ -50,7 +50,7 @@ class BinTest:
     @property
     def significant(self) -> bool:
         """Whether the differences are statistically significant."""
-        return self.p < SIGNIFICANT
+        return self.p_value < SIGNIFICANT
 
     @property
     def is_notable(self) -> bool:
@@ -65,7 +65,7 @@ class OrderTest:
     Attributes:
         component: "x", "y" or "z" of the signed error with the largest correlation; "length" if signs are unknown.
         correlation: rank correlation with the order.
-        p: two-sided probability of such a correlation by chance.
+        p_value: two-sided probability of such a correlation by chance.
         change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 if the
             correlation is not significant.
         ordered_joint: number, from 1, of a joint whose values follow the order of the rows, so that order and position
@@ -76,7 +76,7 @@ class OrderTest:
 
     component: Literal["x", "y", "z", "length"]
     correlation: float
-    p: float
+    p_value: float
     change: float
     ordered_joint: int | None = None
     joint_correlation: float = 0.0
@@ -85,7 +85,7 @@ class OrderTest:
     @property
     def significant(self) -> bool:
         """Whether the correlation is statistically significant."""
-        return self.p < SIGNIFICANT
+        return self.p_value < SIGNIFICANT
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,18 @@ class ConditionTest:
         low: smallest stated value.
         high: largest stated value.
         correlation: rank correlation.
-        p: two-sided probability of such a correlation by chance.
+        p_value: two-sided probability of such a correlation by chance.
     """
 
     low: float
     high: float
     correlation: float
-    p: float
+    p_value: float
 
     @property
     def significant(self) -> bool:
         """Whether the correlation is statistically significant."""
-        return self.p < SIGNIFICANT
+        return self.p_value < SIGNIFICANT
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class Dependence:
 
 
 @dataclass(frozen=True)
-class NameErrors:
+class FrameOrTargetErrors:
     """Errors of the rows of one frame or target.
 
     Attributes:
@@ -153,26 +153,26 @@ class NameErrors:
 
 
 @dataclass(frozen=True)
-class ErrorsByName:
+class ErrorsByFrameOrTarget:
     """Errors per frame or per target.
 
     Attributes:
         name_errors: errors of every frame or target; empty if there is only one.
         unit: "mm" or "deg", of the RMS errors.
-        p: probability of such differences by chance (Kruskal and Wallis).
+        p_value: probability of such differences by chance (Kruskal and Wallis).
     """
 
-    name_errors: tuple[NameErrors, ...] = ()
+    name_errors: tuple[FrameOrTargetErrors, ...] = ()
     unit: str = "mm"
-    p: float = 1.0
+    p_value: float = 1.0
 
     @property
     def significant(self) -> bool:
         """Whether the differences are statistically significant."""
-        return self.p < SIGNIFICANT
+        return self.p_value < SIGNIFICANT
 
     @property
-    def largest(self) -> NameErrors | None:
+    def largest(self) -> FrameOrTargetErrors | None:
         """Frame or target with the largest RMS error under the model; None if there are no rows."""
         return max((one for one in self.name_errors if one.rows), key=lambda one: one.after, default=None)
 
@@ -229,7 +229,7 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
     return tuple(result)
 
 
-def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
+def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByFrameOrTarget:
     """Compute errors per name, and test whether they differ; empty if there is only one name.
 
     Args:
@@ -240,7 +240,7 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName
     judged = np.isfinite(after)
     number, different = numbers_of_names(names).numpy(), dict.fromkeys(names)
     if len(different) < 2:
-        return ErrorsByName()
+        return ErrorsByFrameOrTarget()
     residual = rows.residual.numpy() * 1e3
     result = []
     for k, name in enumerate(different):
@@ -248,9 +248,9 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName
         signed = residual[inside]
         bias = tuple(np.nanmean(signed, 0).tolist()) if np.isfinite(signed).all(1).any() else None
         rms = [root_mean_square(lengths[inside]) for lengths in (before, after)]
-        result.append(NameErrors(name, int(inside.sum()), rms[0], rms[1], bias))
+        result.append(FrameOrTargetErrors(name, int(inside.sum()), rms[0], rms[1], bias))
     _, chance = kruskal_wallis(number[judged], after[judged])
-    return ErrorsByName(tuple(result), unit, chance)
+    return ErrorsByFrameOrTarget(tuple(result), unit, chance)
 
 
 def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:

@@ -29,10 +29,15 @@ from pisigma.robot.frame_fits import (
     best_tool,
     smallest_error,
 )
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause, length_text
-from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm, error_with_fitted
+from pisigma.validation.setup_faults.hypothesis import (
+    COLLAPSED,
+    Hypothesis,
+    PredictingArm,
+    squared_error_with_frames,
+)
 from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps
 
 if TYPE_CHECKING:
@@ -65,17 +70,17 @@ _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
 
 
-def plausible_turn(robot: Robot) -> float:
+def plausible_orientation_error(robot: Robot) -> float:
     """Return the largest orientation errors of a calibrated robot [rad].
 
     They are treated as position errors at a distance of `LEVER_SHARE` of the reach.
     """
-    return plausible_share(robot) / LEVER_SHARE
+    return plausible_error_per_reach(robot) / LEVER_SHARE
 
 
 def explanation_limit(as_stated: Hypothesis, robot: Robot) -> float:
     """Return the largest error [m] that an explanation may leave."""
-    return min(COLLAPSED * as_stated.error, plausible_share(robot) * robot.reach)
+    return min(COLLAPSED * as_stated.error, plausible_error_per_reach(robot) * robot.reach)
 
 
 def choose_simplest(fault_hypotheses: Sequence[Hypothesis], max_error: float) -> list[Hypothesis]:
@@ -134,7 +139,7 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     tried = list(other_conventions(here.measured.rotation))
     R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
     for mode in arm.fits_of_frames:
-        errors = error_with_fitted(mode, here.T, replace(here.measured, rotation=R))
+        errors = squared_error_with_frames(mode, here.T, replace(here.measured, rotation=R))
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
         for number in errors.argsort()[:_MAX_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:
@@ -197,9 +202,9 @@ def frame_hypotheses(
         yield here
         X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
         yield from moved(here, X @ here.T, 6 * count, frame=X)
-        yield from moved(here, here.T @ Y, here.values_of_tool * tools, tool=Y)
+        yield from moved(here, here.T @ Y, here.tool_value_count * tools, tool=Y)
     for here, base, tool in _with_frames_fitted(hypotheses, max_error) if count == tools == 1 else ():
-        fitted = 6 + here.values_of_tool
+        fitted = 6 + here.tool_value_count
         yield from moved(here, base @ here.T @ tool, fitted, frame=base[None], tool=tool[None])
 
 

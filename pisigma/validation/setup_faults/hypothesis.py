@@ -100,7 +100,7 @@ class PredictingArm:
             modes: frames that are fitted.
 
         Returns:
-            The mean squared error of every hypothesis, see `error_with_fitted`.
+            The mean squared error of every hypothesis, see `squared_error_with_frames`.
         """
         chunks = [
             forward_kinematics(self.robot, some)
@@ -109,11 +109,11 @@ class PredictingArm:
             for some in torch.split(q, max(1, _MAX_POSES // rows.rows))
         ]
         return torch.stack(
-            [torch.cat([error_with_fitted(mode, T, measured) for T in chunks]) for mode in modes]
+            [torch.cat([squared_error_with_frames(mode, T, measured) for T in chunks]) for mode in modes]
         )
 
 
-def error_with_fitted(
+def squared_error_with_frames(
     mode: FittedFrames, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
     """Compute the mean squared error [m²] of predicted poses, either unchanged or with frames fitted.
@@ -153,7 +153,7 @@ class Hypothesis:
         return sum(cause.complexity for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
     @property
-    def values_of_tool(self) -> int:
+    def tool_value_count(self) -> int:
         """Number of parameters of a tool: 6 with orientations, otherwise 3."""
         return 6 if bool(self.measured.has_rotation.any()) else 3
 

@@ -46,7 +46,7 @@ MIN_ROWS_NOMINAL = 24
 _LARGEST_ZERO = 0.1
 """Largest standard deviation of the zeros of revolute joints of industrial arms and cobots after a repair [rad]."""
 _MAX_ZEROS = 3.0
-"""Ratio of the largest plausible error of a single zero to `largest_zero`."""
+"""Ratio of the largest plausible error of a single zero to `largest_zero_sigma`."""
 _MAX_SLIDE = 3 * HOBBY.max_sizes.length
 """Largest plausible error of the zero of a prismatic joint [m]."""
 _USUAL = 1e-3
@@ -65,7 +65,7 @@ _MAX_CLUSTERINGS = 8
 """Largest number of iterations, each of which assigns rows to the nearest target and refits base and targets."""
 
 
-def largest_zero(robot: Robot) -> float:
+def largest_zero_sigma(robot: Robot) -> float:
     """Return the largest standard deviation [rad] of revolute joint zeros in this manufacturer's class of robots."""
     return max(_LARGEST_ZERO, RobotClass.from_robot(robot).max_sizes.joint_offset)
 
@@ -140,7 +140,10 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     except IdentificationError:
         return math.inf
     moved = (fitted.dh - robot.dh)[:, :2]
-    if np.abs(moved[:, 0]).max() > _MAX_ZEROS * largest_zero(robot) or np.abs(moved[:, 1]).max() > _MAX_SLIDE:
+    if (
+        np.abs(moved[:, 0]).max() > _MAX_ZEROS * largest_zero_sigma(robot)
+        or np.abs(moved[:, 1]).max() > _MAX_SLIDE
+    ):
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
     here = next(frame_hypotheses(arm, rows, [Hypothesis(rows.q, arm.poses(rows), measured)]))

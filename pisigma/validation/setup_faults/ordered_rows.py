@@ -127,7 +127,7 @@ class OrderedRows:
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
         motion = problem.motion(solved.refined_linearisation.point, whole, every)
         unknowns = problem.space.sensor_unknowns(solved.refined_linearisation.point)
-        R = solved.setup.anchors.bases[:, :3, :3][problem.frame]
+        R = solved.setup.reference_frames.bases[:, :3, :3][problem.frame]
         residuals, derivatives, values, noise = [], [], 0, []
         for k, sensor in enumerate(problem.sensors):
             sigma = float(view.noise[k]) if learned is None else learned.noise[sensor.name]

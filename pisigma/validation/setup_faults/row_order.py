@@ -352,7 +352,7 @@ class _Search:
         names = self.rows.problem.space.targets
         if candidate.moved == "frame":
             names = self.rows.problem.space.frames
-            anchor = self.rows.result.solved.setup.anchors.bases[candidate.number].cpu().numpy()
+            anchor = self.rows.result.solved.setup.reference_frames.bases[candidate.number].cpu().numpy()
             center = self._center(self.rows.row_index[candidate.index[candidate.first or 0 :]])
             # The base rotates about its anchor, so the shift of the measured points is that of their centre.
             lever = anchor[:3, :3].T @ (center - anchor[:3, 3])

@@ -123,7 +123,7 @@ def fault_of_cause(cause: Cause, rms_before: float, rms_after: float) -> SetupFa
     )
 
 
-def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
+def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, nominal_rms_after: float) -> SetupFault:
     """Return the fault of a hypothesis, with errors before (`as_stated`) and after, and of the nominal robot [m]."""
     (before, before_rotation), (after, after_rotation) = as_stated.rms(), other.rms()
     return SetupFault(
@@ -132,7 +132,7 @@ def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, after_nomina
         advice="; ".join(cause.advice for cause in other.causes),
         rms_before=before,
         rms_after=after,
-        nominal_rms_after=after_nominal,
+        nominal_rms_after=nominal_rms_after,
         rotation_rms_before=before_rotation,
         rotation_rms_after=after_rotation,
         largest_zero_shift=max(cause.largest_zero_shift for cause in other.causes),

@@ -9,7 +9,7 @@ import torch
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_known_names
@@ -19,7 +19,7 @@ from pisigma.validation.setup_faults.explanations import (
     explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
-    plausible_turn,
+    plausible_orientation_error,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NOTICED
@@ -64,7 +64,7 @@ def find_setup_faults(
     Returns:
         The faults; empty if the errors are below 0.02 mm, or if nothing explains them.
     """
-    judged = judged_values(model, measurements)
+    judged = without_unknown_orientation(model, measurements)
     some = judged.select(evenly_spaced_rows(measured_rows(judged), MAX_ROWS))
     known = with_known_names(model, some, fitted)
     T = poses_of_rows(model, known)
@@ -110,7 +110,7 @@ def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: H
     return next(one.rms()[0] for one in tried if {cause.kind for cause in one.causes} == wanted)
 
 
-def judged_values(model: CalibratedModel, measurements: Measurements) -> Measurements:
+def without_unknown_orientation(model: CalibratedModel, measurements: Measurements) -> Measurements:
     """Return the rows without orientations if the orientation of the tool is unknown to the model."""
     if has_orientation(model):
         return measurements
@@ -125,15 +125,20 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
         model: the model.
     """
     orientation = figures.orientation if has_orientation(model) else None
-    limit = plausible_share(model.robot) * model.robot.reach
+    limit = plausible_error_per_reach(model.robot) * model.robot.reach
     turn = 0.0 if orientation is None else np.deg2rad(orientation.statistics["rms"])
-    return figures.position.statistics["rms"] * 1e-3 > limit > 0 or turn > plausible_turn(model.robot)
+    return figures.position.statistics["rms"] * 1e-3 > limit > 0 or turn > plausible_orientation_error(
+        model.robot
+    )
 
 
 def unexplained_diagnostic(model: CalibratedModel) -> Diagnostic:
     """Return the finding that no setup fault explains implausible errors of a model, with advice on what to check."""
     robot = model.robot
-    limit, turn = plausible_share(robot) * robot.reach * 1e3, np.rad2deg(plausible_turn(robot))
+    limit, turn = (
+        plausible_error_per_reach(robot) * robot.reach * 1e3,
+        np.rad2deg(plausible_orientation_error(robot)),
+    )
     return Diagnostic(
         kind="implausible_errors",
         severity="implausible",

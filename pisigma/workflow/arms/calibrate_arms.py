@@ -45,7 +45,7 @@ from pisigma.validation.held_out.trained_calibrations import geometric_result
 from pisigma.workflow.arms.torso import torso_joints, torso_settings, with_common_joints
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.cell_file import CameraSection, CellDocument, CellFile, path_inside_cell
-from pisigma.workflow.cell.new_files import save_new
+from pisigma.workflow.cell.new_files import save_under_new_name
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 FRAMES_FILE = "frames.yaml"
@@ -357,4 +357,4 @@ def calibrate_arms_of_cell(
     if not (found.trusted or accept_implausible):
         return found, None
     save = partial(found.save, accept_implausible=accept_implausible)
-    return found, save_new(Path(folder) / MODELS, save, ())
+    return found, save_under_new_name(Path(folder) / MODELS, save, ())

@@ -17,8 +17,8 @@ from pisigma.calibration.frames.shared_objects import ArmPosterior
 from pisigma.files.errors import ModelError, Place, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.files.yaml_file import Section, read_yaml
-from pisigma.lifetime.comparison.moved_bases import ArmBefore, MovedBases, MovedBody, find_moved_bases
-from pisigma.lifetime.recalibration.movement import deviation_along
+from pisigma.lifetime.comparison.moved_bases import MovedBases, MovedBody, RemeasuredArm, find_moved_bases
+from pisigma.lifetime.recalibration.movement import sigma_along
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -164,7 +164,7 @@ def _arm(
     T_first_base: Float64[Tensor, "4 4"],
     data: Measurements | MeasurementFiles,
     cameras: CameraFiles | None,
-) -> ArmBefore:
+) -> RemeasuredArm:
     stated = next(one for one in summary.arms if one.name == name)
     if model_hash(folder / name) != stated.sha256:
         raise ModelError(
@@ -181,7 +181,7 @@ def _arm(
             remedy="calibrate the arms without `model: geometric`",
         )
     rows = read_rows(data, model.robot, cameras)
-    return ArmBefore(
+    return RemeasuredArm(
         ArmPosterior(name, model.uncertainty, torso=stated.torso),
         T_first_base,
         frames_of_model(model, rows, "base"),
@@ -197,6 +197,6 @@ def _figures(one: MovedBody, is_named: bool) -> MovedFigures:
         shift_mm=tuple((one.shift * 1e3).tolist()),
         rotation_deg=tuple(one.rotation.rad2deg().tolist()),
         standard_errors=tuple(sizes.tolist()),
-        distance_error_mm=deviation_along(one.shift, one.covariance[:3, :3]) * 1e3,
+        distance_error_mm=sigma_along(one.shift, one.covariance[:3, :3]) * 1e3,
         log_likelihood=one.log_likelihood,
     )

@@ -29,15 +29,15 @@ from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.model_choice import (
     calibrate_rows,
-    check_entry,
     is_better,
     model_entry,
+    monitoring_check_entry,
     put_into_use,
     unrecorded_changes,
     with_warnings,
 )
 from pisigma.workflow.cell.new_cell import NewCell
-from pisigma.workflow.cell.new_files import free_path, save_new
+from pisigma.workflow.cell.new_files import free_path, save_under_new_name
 from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import RowsWithModelNames
 from pisigma.workflow.evaluate import Evaluation, evaluate
@@ -275,7 +275,9 @@ class Cell:
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
-            self.history.add(check_entry(found, entry, one, seen, self.file.settings_of_step("recalibrate")))
+            self.history.add(
+                monitoring_check_entry(found, entry, one, seen, self.file.settings_of_step("recalibrate"))
+            )
         assert found is not None  # there is a session
         return replace(found, warnings=(*warnings, *found.warnings))
 
@@ -370,7 +372,7 @@ class Cell:
     def _saved(self, result: Calibration | Recalibration, accept_implausible: bool) -> Path:
         """Save a model under a name that no model of the cell has had; return its folder."""
         names = [one.name for one in self.history.models()]
-        return save_new(
+        return save_under_new_name(
             self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible), names
         )
 

@@ -120,7 +120,7 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
     }
 
 
-def check_entry(
+def monitoring_check_entry(
     monitoring: MonitoringResult,
     entry: ModelEntry,
     session: SessionEntry,

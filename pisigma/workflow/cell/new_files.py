@@ -47,7 +47,7 @@ def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
     return free_path(folder, datetime.date.today().isoformat(), suffix)
 
 
-def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str]) -> Path:
+def save_under_new_name(folder: Path, save: Callable[[Path], object], taken: Collection[str]) -> Path:
     """Save a model under a new name, today's date, even if other processes save models in the same folder.
 
     Args:
@@ -68,7 +68,7 @@ def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str
                 raise
 
 
-def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
+def write_under_new_name(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
     """Write a session with a new name, completely or not at all, even if other processes write to the folder.
 
     Args:

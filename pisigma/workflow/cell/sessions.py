@@ -32,7 +32,7 @@ from pisigma.model.training_rows import known_rows
 from pisigma.robot.description import Robot
 from pisigma.validation.gate import RowVerdict, check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workflow.cell.new_files import write_new
+from pisigma.workflow.cell.new_files import write_under_new_name
 from pisigma.workflow.cell.setup_names import RowsWithModelNames, newest_day, with_setup_names
 from pisigma.workflow.recalibrate import allowed_moves
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
@@ -105,7 +105,7 @@ class Sessions:
             content = Path(file).read_bytes()
             inside = Path(file) if Path(file).parent.resolve() == self.folder.resolve() else None
         taken = {one.name for one in self.history.sessions()}
-        path = inside or write_new(self.folder, entry.day, content, taken)
+        path = inside or write_under_new_name(self.folder, entry.day, content, taken)
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
         models = [] if fitted is None else [with_session(fitted, entry)]
         if not self.history.add_session(entry, *models):  # another process was faster

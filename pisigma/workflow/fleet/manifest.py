@@ -16,7 +16,7 @@ from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import read_table
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
-from pisigma.workflow.cell.new_files import write_new
+from pisigma.workflow.cell.new_files import write_under_new_name
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
@@ -248,5 +248,5 @@ def _add_sessions(cell: NewCell, folder: Path) -> int:
     present = {sha256_of(path) for path in (folder / SESSIONS).glob("*.csv")}
     new = [(name, file) for name, file in cell.sessions if sha256_of(file) not in present]
     for name, file in new:
-        write_new(folder / SESSIONS, name, file.read_bytes(), ())
+        write_under_new_name(folder / SESSIONS, name, file.read_bytes(), ())
     return len(new)

@@ -26,7 +26,7 @@ from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.model_choice import model_entry
-from pisigma.workflow.cell.new_files import save_new
+from pisigma.workflow.cell.new_files import save_under_new_name
 from pisigma.workflow.result import AbstractModelResult
 
 _CHOICES: tuple[FrameChoice, ...] = ("tool", "base", "hand-eye")
@@ -170,7 +170,7 @@ def calibrate_frame_of_cell(
         return found, None
     taken = [one.name for one in cell.history.models()]
     save = partial(found.save, accept_implausible=accept_implausible)
-    path = save_new(cell.folder / MODELS, save, taken)
+    path = save_under_new_name(cell.folder / MODELS, save, taken)
     events = cell.history.events() if parent is None else ()
     remark = f"{only} calibrated with session '{session.name}'"
     entry = model_entry(events, started, path, [session], remark, found, parent)

@@ -143,7 +143,7 @@ def detect(
         MeasurementError: a file cannot be used, the board is symmetric, no image shows it, or joint values with time
             stamps are joined to a video whose start is not stated.
     """
-    timed = joints is not None and not names_images(joints)
+    timed = joints is not None and not has_image_column(joints)
     videos = [path for path in map(Path, images) if is_video(path)]
     if timed and videos and settings.video_start is None:
         raise MeasurementError(
@@ -179,7 +179,7 @@ def detect(
     return result
 
 
-def names_images(path: str | os.PathLike[str]) -> bool:
+def has_image_column(path: str | os.PathLike[str]) -> bool:
     """Return whether a log of joint values names the images; otherwise it contains times.
 
     Raises:

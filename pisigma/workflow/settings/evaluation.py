@@ -63,7 +63,7 @@ class Limits:
         Raises:
             MeasurementError: there is a limit on the orientation error, but no orientations were measured.
         """
-        from pisigma.reporting.tables import figure_text
+        from pisigma.reporting.tables import number_text
 
         sentences = []
         for key, limit in self.stated_limits.items():
@@ -79,7 +79,7 @@ class Limits:
                 )
             value = errors.statistics[statistic]
             if not value <= limit:
-                text = figure_text(value) if figure_text(value) != figure_text(limit) else value
+                text = number_text(value) if number_text(value) != number_text(limit) else value
                 sentences.append(
                     f"the {what} of {model.name} is {text} {unit}; --{option} allows {limit:g} {unit}"
                 )

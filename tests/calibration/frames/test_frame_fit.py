@@ -92,7 +92,7 @@ def test_coordinate_that_no_touch_determines_keeps_its_value(count, noise):
         (weak,) = fit.weak_directions
         assert (weak.combination, weak.is_held) == ("tool_x", True)
         assert (40 < weak.sigma < np.inf) == bool(noise)  # noise turns the tip, which looks like information
-        assert fit.undetermined == {fit.solved.problem.space.index("tool_x")}
+        assert fit.undetermined_indices == {fit.solved.problem.space.index("tool_x")}
         assert_close(fit.estimates[0], TURNED.tool[0], atol=1e-4)
         assert_close(fit.estimates[1:], TIP[1:3], atol=1e-9 + 6 * NOISE * noise)
         assert fit.covariance[0, 0] > 0.05**2
@@ -104,7 +104,7 @@ def test_only_the_last_joint_turned():
     q[:, 5] += torch.linspace(-2, 2, 6)
     rows = Measurements(q=q + torch.from_numpy(random_noise(6, 0).repeat(2, 1)), socket=("point",) * 6)
     fit = fit_frames(TURNED, rows, "tool")
-    assert fit.undetermined == {fit.solved.problem.space.index("tool_z")}
+    assert fit.undetermined_indices == {fit.solved.problem.space.index("tool_z")}
     assert_close(fit.estimates[2], TURNED.tool[2], atol=1e-4)
     assert_close(fit.estimates[:2], np.zeros(2), atol=5e-4)
 

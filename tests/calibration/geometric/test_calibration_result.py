@@ -63,7 +63,7 @@ def test_observability_and_rank(result: CalibrationResult) -> None:
     assert result.rank == 30
     assert_close(result.condition_number * result.observability.O2, 1.0, atol=1e-9)
     assert result.observability.O5 < result.observability.O3 < result.observability.O1 * 80**0.5
-    assert result.pairwise.no_effect == ()
+    assert result.pairwise_redundancy.no_effect == ()
 
 
 def test_observability_indices_of_a_known_matrix() -> None:

@@ -6,7 +6,7 @@ from testing.closeness import assert_close
 from testing.phone_arm import arm_before_phone, rows_of_phone
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_sigma_factor
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.robot import Robot
 
@@ -15,7 +15,7 @@ def estimated_scatter(rows):
     """Return the estimated standard deviation of joint values [rad]."""
     result = GeometricCalibrator(Robot.load("so101")).fit(rows)
     (noise,) = (one.sigma for one in result.noise if one.sensor == "corner")
-    return result.solved.setup.joint_repeatability * corner_factor(rows, noise)
+    return result.solved.setup.joint_repeatability * corner_sigma_factor(rows, noise)
 
 
 @pytest.mark.parametrize(

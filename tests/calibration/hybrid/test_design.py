@@ -77,10 +77,10 @@ def test_a_prior_starts_from_the_sizes_that_another_design_came_to(arm: Linearis
     small = Design(problem, (FourierSeries(robot, 2), ScaledJoints(robot)))
     large = Design(problem, (GravityTorques(robot), ScaledJoints(robot), FourierSeries(robot, 4)))
     sizes = torch.tensor([0.5, 2.0, 1.0, 3.0, 1e-4, 2e-4, 5e-4], dtype=torch.float64)
-    found = large.prior_like(small, replace(small.prior((1.0,) * 4), sizes=sizes))
+    found = large.prior_with_sizes_of(small, replace(small.prior((1.0,) * 4), sizes=sizes))
     expected = [0.5, 2.0, 1.0, 3.0, FIRST_SIZE, 5e-4, 1e-4, 2e-4, 2e-4, 2e-4]
     assert_close(found.sizes, torch.tensor(expected, dtype=torch.float64), rtol=1e-7)
-    assert_close(found.base, large.prior((1.0,) * 4).base)
+    assert_close(found.unit_precision, large.prior((1.0,) * 4).unit_precision)
 
 
 def test_columns_that_a_joint_does_not_have_get_no_unknown(arm: LinearisedArm) -> None:
@@ -115,7 +115,7 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
 def test_weights_of_a_prismatic_joint_are_scaled_by_the_reach(arm: LinearisedArm) -> None:
     robot = arm.rows.problem.space.robot
     design = Design(arm.rows.problem, (FourierSeries(robot, 1),))
-    base = design.prior((1.0,) * 4).base[design.weights_of(0)].view(4, 2)
+    base = design.prior((1.0,) * 4).unit_precision[design.weights_of(0)].view(4, 2)
     turning = torch.tensor(robot.revolute)
     assert_close(base[turning], torch.ones(3, 2))
     assert_close(base[~turning], torch.full((1, 2), robot.reach**-2), rtol=1e-6)

@@ -65,7 +65,9 @@ def test_posterior_is_that_of_normal_variables(seed: int) -> None:
     assert_close(found.effective_unknowns, told.sum(), rtol=1e-10)
     assert_close(found.determined_unknowns, np.bincount(GROUP, told), rtol=1e-10)
     assert_close(
-        found.squared_unknowns, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12
+        found.squared_unknowns,
+        np.bincount(GROUP, prior().unit_precision.numpy() * found.x.numpy() ** 2),
+        rtol=1e-12,
     )
 
 
@@ -82,7 +84,7 @@ def test_unknowns_without_a_prior_add_a_constant_to_the_log_evidence() -> None:
     """It is the limit of a prior that gets ever wider, less what its width alone comes to."""
     X, y = problem()
     known, wide = prior(), 1e-6
-    flat = replace(known, base=torch.where(GROUP == 0, 0.0, known.base))
+    flat = replace(known, unit_precision=torch.where(GROUP == 0, 0.0, known.unit_precision))
     precision = torch.where(GROUP == 0, wide, known.precision)
     constant = 0.5 * sum(map(len, y)) * math.log(2 * math.pi) - 0.5 * 2 * math.log(wide)
     found = DenseRegression.between(X, y).solve(flat, NOISE).log_evidence

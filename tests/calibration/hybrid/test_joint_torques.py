@@ -11,7 +11,7 @@ import torch
 from testing.closeness import assert_close
 from testing.refusals import refused
 
-from pisigma.calibration.geometric.problem.noise import number_repeats
+from pisigma.calibration.geometric.problem.noise import repeat_indices
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.deployment.export.onnx_model import export_onnx, onnx_remarks
@@ -147,7 +147,7 @@ def test_the_differences_from_modelled_torques_are_those_of_other_rows_and_corre
     options = FeatureOptions((), (0.0, 0.0, -1.0), 40)
     (feature,) = JointTorques.candidates(ROBOT, options, JointState.from_measurements(rows))
     covariance = torch.tensor(feature.covariance).double()
-    missed = other.torque - feature.modelled(JointState(other.q))
+    missed = other.torque - feature.modelled_torques(JointState(other.q))
     ratio = covariance.diagonal()[1:4].sqrt() / missed[:, 1:4].square().mean(0).sqrt()
     assert bool(((ratio > 0.6) & (ratio < 1.7)).all())
     assert_close(
@@ -206,7 +206,7 @@ def test_rows_with_another_load_are_not_repeats_of_a_pose_and_noise_of_torques_i
     )
     loaded = poses.torque + torch.tensor([0.0, 30.0, 10.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     rows = dataclasses.replace(rows, torque=torch.cat([poses.torque, poses.torque + noise, loaded]))
-    key = number_repeats(repeat_key(rows)).view(3, 20)
+    key = repeat_indices(repeat_key(rows)).view(3, 20)
     assert bool((key[0] == key[1]).all())
     assert not bool((key[0] == key[2]).any())
 

@@ -148,7 +148,7 @@ def test_initial_sizes_nearly_reach_the_gain_of_the_whole_fit() -> None:
     gain, sizes = largest.evidence_gain(before, design, products)
     assert sizes is not None
     assert len(sizes) == robot.dof
-    held = largest.design.prior_like(design, before.prior)
+    held = largest.design.prior_with_sizes_of(design, before.prior)
     held = replace(held, sizes=torch.cat([before.prior.sizes, sizes]))
     there = largest.solve(held, before.noise)
     assert_close(gain, there.log_evidence - before.log_evidence, atol=1e-3)

@@ -112,7 +112,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     search = search_of(rows_of(gravity + gears, q))
     best = search.select_features(SERIES, [SMALL])
     assert best.name == "gravity + series 6"
-    assert best.largest_share == MAX_USUAL_SHARE
+    assert best.max_effective_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEAR_EVIDENCE

@@ -66,7 +66,7 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
 
 def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
     fit, prior = small_problem()
-    flat = replace(prior, base=torch.where(prior.group == 2, prior.base, 0.0))
+    flat = replace(prior, unit_precision=torch.where(prior.group == 2, prior.unit_precision, 0.0))
     posterior = fit.solve(flat, (0.4,))
     added = prior_size_columns(posterior, fit.covariance_root(posterior))
     assert_close(added, torch.zeros_like(added))

@@ -36,7 +36,7 @@ def test_a_smaller_design_equals_one_built_directly(name: str) -> None:
     )
     assert_close(found.X, made.X)
     assert_close(found.K, made.K, rtol=1e-12, atol=1e-12 * float(made.K.abs().max()))
-    prior = small.prior_like(case.design, case.prior)
+    prior = small.prior_with_sizes_of(case.design, case.prior)
     dense = DenseRegression.from_rows(small, case.rows)
     assert_same_posterior(found, dense, prior, case.noise, case.exactness)
 

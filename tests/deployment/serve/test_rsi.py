@@ -123,7 +123,7 @@ def test_a_pose_that_the_real_arm_cannot_reach_ends_the_stream():
 
 
 def test_corrections_and_changes_above_the_limits_end_the_stream(ik, answers):
-    largest = answers.counts.largest_deg
+    largest = answers.counts.largest_correction_deg
     stream = RsiAnswers(ik, "pisigma", largest * 0.99)
     with refused(RequestError, option="AKorr", expected=f"corrections of at most {largest * 0.99:g} deg"):
         stream.answer(packet(START, 0))

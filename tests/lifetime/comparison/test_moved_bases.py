@@ -14,7 +14,7 @@ from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.shared_objects import uncertainty_of
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError
-from pisigma.lifetime.comparison.moved_bases import ArmBefore, MovedBases, find_moved_bases
+from pisigma.lifetime.comparison.moved_bases import MovedBases, RemeasuredArm, find_moved_bases
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.frame_model import frames_of_model
 from pisigma.model.geometric_model import model_of_calibration
@@ -41,7 +41,7 @@ def moved(seed: int, bump: torch.Tensor, *bodies: str) -> MovedBases:
             frames_of_model(model(k, seed), rows_now(k, seed, bump, bodies[k % len(bodies)]), "base")
             for k in range(2)
         ]
-        return find_moved_bases([ArmBefore(*one) for one in zip(before, T, now, strict=True)])
+        return find_moved_bases([RemeasuredArm(*one) for one in zip(before, T, now, strict=True)])
 
 
 def bump(millimetres: float, milliradians: float) -> torch.Tensor:
@@ -99,11 +99,11 @@ def test_frame_whose_base_was_not_determined_is_not_compared():
     with no_type_checker():
         known = posterior("left", own_fit(0, 0, "hall"))
         found = frames_of_model(model(0, 0), rows_now(0, 0, STILL, ""), "base")
-    assert ArmBefore(known, STILL, found).frames == ("hall",)
+    assert RemeasuredArm(known, STILL, found).frames == ("hall",)
     root = known.covariance_root.clone()
     root[known.base_rows("hall")[0]] = 0.0
     held = replace(known.uncertainty, covariance_root=CovarianceRoot(root))
-    arm = ArmBefore(replace(known, uncertainty=held), STILL, found)
+    arm = RemeasuredArm(replace(known, uncertainty=held), STILL, found)
     assert arm.frames == ()
     with refused(IdentificationError, value="hall"):
         find_moved_bases([arm])

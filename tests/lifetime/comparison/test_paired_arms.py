@@ -43,7 +43,7 @@ def test_a_difference_of_2_deg_is_named_with_its_sign_and_arm(seed):
     joint, sign, moved = seed % 4, (-1) ** (seed // 2), ("leader", "follower")[seed % 2]
     for positions in (("leader", "follower"), ("follower",)):
         found = session(seed, moved, joint, 2.0 * sign, positions)
-        named = [(one.joint, one.moved) for one in found if one.verdict == "different"]
+        named = [(one.joint, one.moved_arm) for one in found if one.verdict == "different"]
         assert named == [(NAMES[joint], moved)]
         expected = 2.0 * sign * (1 if moved == "leader" else -1)
         error = math.degrees(found[joint].value) - expected
@@ -59,7 +59,7 @@ def test_arms_that_agree_raise_no_alarm():
 def test_rows_that_are_too_few_or_too_noisy_show_neither_a_difference_nor_agreement():
     noisy = session(0, positions=(), servo=math.radians(5.0))
     assert {one.verdict for one in noisy} == {"unknown"}
-    assert {one.moved for one in noisy} == {None}
+    assert {one.moved_arm for one in noisy} == {None}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_rows_that_are_too_few_or_too_noisy_show_neither_a_difference_nor_agreem
 )
 def test_an_arm_that_the_measurement_excludes_is_not_named(changes, positions, moved):
     one = session(5, None, 1, changes, positions)[1]
-    assert (one.verdict, one.moved) == ("different", moved)
+    assert (one.verdict, one.moved_arm) == ("different", moved)
 
 
 def test_full_turns_are_no_difference():
@@ -87,8 +87,8 @@ def test_full_turns_are_no_difference():
 
 def test_without_positions_the_arm_is_unknown():
     """Positions on the axis of the last joint do not show its zero."""
-    assert session(3, "leader", 1, 2.0, ())[1].moved == "unknown"
-    assert [one.moved for one in session(3, "leader", 4, 2.0)][4] in ("unknown", "leader")
+    assert session(3, "leader", 1, 2.0, ())[1].moved_arm == "unknown"
+    assert [one.moved_arm for one in session(3, "leader", 4, 2.0)][4] in ("unknown", "leader")
 
 
 def test_rows_that_do_not_fit_are_refused():

@@ -60,7 +60,7 @@ def test_parameters_equivalent_to_base_and_tool_have_no_shift():
     by_name = {one.name: one for one in parameters}
     for name in ("theta_1", "d_1", "theta_6", "d_6", "a_6", "alpha_6"):
         assert by_name[name].shift is None
-    assert by_name["d_2"].equivalent == ("d_3", "d_4")  # along parallel axes
+    assert by_name["d_2"].equivalent_parameters == ("d_3", "d_4")  # along parallel axes
 
 
 def test_a_nominal_robot_has_no_uncertainty():
@@ -84,4 +84,4 @@ def test_a_model_without_posterior_is_compared_without_tests():
         ModelPair.from_models(first, replace(model_of(51), uncertainty=None), "fitted")
     )
     assert differences.remainder is None
-    assert all(one.p is None and one.sigmas[1] is None for one in differences.parameters)
+    assert all(one.p_value is None and one.sigmas[1] is None for one in differences.parameters)

@@ -46,4 +46,4 @@ def test_the_prior_is_the_posterior_of_the_model():
     still = problem.with_fixed_arm()
     assert still.covariance_root.shape[1] == 0
     assert still.groups == ()
-    assert_close(still.fixed_root, problem.covariance_root)
+    assert_close(still.held_covariance_root, problem.covariance_root)

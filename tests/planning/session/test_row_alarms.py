@@ -7,8 +7,8 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.session.row_alarms import (
     contradiction_alarm,
-    other_joint_values,
-    stale_readings,
+    stale_reading_alarms,
+    unplanned_joint_alarms,
     unreadable_alarm,
 )
 from pisigma.planning.session.row_judgement import judge_rows
@@ -30,16 +30,16 @@ def test_an_unreadable_row_has_to_be_measured_again():
 def test_a_frozen_sensor_and_a_row_written_twice():
     rows = PLAN.rows(4)
     frozen = Measurements(q=PLAN.stored.q[4:5], position=rows.position[2:3], line=(6,))
-    (alarm,) = stale_readings(join([rows, frozen]), 4)
+    (alarm,) = stale_reading_alarms(join([rows, frozen]), 4)
     assert alarm.kind == "frozen"
     assert alarm.line == 6
     assert "line 4" in alarm.sentence
     assert alarm.repeat
     again = Measurements(q=rows.q[2:3], position=rows.position[2:3], line=(6,))
-    (alarm,) = stale_readings(join([rows, again]), 4)
+    (alarm,) = stale_reading_alarms(join([rows, again]), 4)
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("duplicate", False, False)
     balls = Measurements(q=rows.q[[0, 1, 0]], socket=("a", "a", "a"), line=(2, 3, 4))
-    (alarm,) = stale_readings(balls, 1)
+    (alarm,) = stale_reading_alarms(balls, 1)
     assert (alarm.kind, alarm.line) == ("duplicate", 4)
 
 
@@ -47,13 +47,13 @@ def test_joint_values_off_the_plan_are_a_remark():
     q = PLAN.stored.q[:3].clone()
     q[1, 2] += torch.deg2rad(torch.tensor(1.2))
     q[2, 0] += 1.0
-    near, far = other_joint_values(ROBOT, PLAN.measure(q), 0, PLAN.stored.q, NAMES)
+    near, far = unplanned_joint_alarms(ROBOT, PLAN.measure(q), 0, PLAN.stored.q, NAMES)
     assert "1.20 deg" in near.sentence
     assert "pose 2 of the plan" in near.sentence
     assert not any(name in far.sentence for name in NAMES)
     assert near.counts
     assert not near.repeat
-    (alarm,) = other_joint_values(ROBOT, PLAN.measure(q[:1].deg2rad()), 0, PLAN.stored.q, NAMES)
+    (alarm,) = unplanned_joint_alarms(ROBOT, PLAN.measure(q[:1].deg2rad()), 0, PLAN.stored.q, NAMES)
     assert "pose 1 of the plan" in alarm.sentence
     assert "radians" in alarm.sentence
 

@@ -127,7 +127,7 @@ def test_errors_per_frame_and_target(tmp_path):
     wall = np.array([name == "wall" for name in arm.measurements.frame])
     assert_close(names[0].after, np.sqrt((error[wall] ** 2).mean()), rtol=1e-12)
     assert_close(names[0].bias, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9, atol=1e-12)
-    assert 0 < content.frames.p <= 1
+    assert 0 < content.frames.p_value <= 1
     assert content.frames.largest.after == max(one.after for one in names)
     assert len(content.targets.name_errors) == 2
 

@@ -281,7 +281,7 @@ def test_a_session_never_replaces_a_file_that_appeared_meanwhile(tmp_path, monke
     (tmp_path / "2026-01-10.csv").write_text("another process")
     offered = iter([tmp_path / "2026-01-10.csv", tmp_path / "2026-01-10-2.csv"])
     monkeypatch.setattr(new_files, "free_path", lambda *arguments: next(offered))
-    path = new_files.write_new(tmp_path, "2026-01-10", b"rows", ())
+    path = new_files.write_under_new_name(tmp_path, "2026-01-10", b"rows", ())
     assert path.read_bytes() == b"rows"
     assert (tmp_path / "2026-01-10.csv").read_text() == "another process"
     assert sorted(one.name for one in tmp_path.iterdir()) == ["2026-01-10-2.csv", "2026-01-10.csv"]

@@ -59,7 +59,7 @@ class PairwiseRedundancy:
 
 def find_pairwise_redundancy(
     information: Information,
-    sizes: Float64[np.ndarray, " parameters"],
+    nominal_values: Float64[np.ndarray, " parameters"],
     tolerance: float = _CORRELATION_TOLERANCE,
 ) -> PairwiseRedundancy:
     """Find pairs of parameters whose columns of the Jacobian have |r| = 1 (Park et al. 2022, section 3.2).
@@ -69,13 +69,13 @@ def find_pairwise_redundancy(
 
     Args:
         information: the condensed Jacobian.
-        sizes: nominal values, see `find_redundancy`.
+        nominal_values: nominal values, see `find_redundancy`.
         tolerance: see `_CORRELATION_TOLERANCE`.
     """
     columns = information.jacobian
     lengths = np.linalg.norm(columns, axis=0)
     acting = lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300)
-    parameters, preference = information.parameters, selection_weights(information.parameters, sizes)
+    parameters, preference = information.parameters, selection_weights(information.parameters, nominal_values)
     order = sorted(range(len(parameters)), key=lambda i: (_PAPER_ORDER.index(parameters[i].group), i))
     tables, sets, dropped = [], [], set()
     for unit in ("m", "rad"):

@@ -10,7 +10,7 @@ from pisigma.calibration.geometric.problem.least_squares import Linearisation
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.files.errors import ImplausibleError, Place
-from pisigma.robot.robot_class import plausible_share
+from pisigma.robot.robot_class import plausible_error_per_reach
 
 _DISTANCES = ("distance", "pair")
 """Sensors that measure distances, which are tested like positions."""
@@ -54,7 +54,7 @@ def refuse_implausible(
         return
     sizes = residual_sizes(problem, linearisation)[torch.stack(judged).any(0)]
     size = float(sizes.median()) if len(sizes) else 0.0
-    if size > plausible_share(robot) * robot.reach:
+    if size > plausible_error_per_reach(robot) * robot.reach:
         raise ImplausibleError(
             f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis "
             f"({100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}'), more than any calibration "

@@ -92,16 +92,16 @@ class RankFindings:
     """Result of the rank analysis.
 
     Attributes:
-        sizes: values of the candidates at the start.
+        nominal_values: values of the candidates at the start.
         redundancy: redundancy of the candidates at the start.
         added_parameters: indices of parameters that were added after the start.
-        estimated: number of unknowns to estimate; see `sufficiency.free_parameters`.
+        estimated_count: number of unknowns to estimate; see `sufficiency.count_estimated_unknowns`.
     """
 
-    sizes: Float64[np.ndarray, " candidates"]
+    nominal_values: Float64[np.ndarray, " candidates"]
     redundancy: Redundancy
     added_parameters: list[int]
-    estimated: int
+    estimated_count: int
 
     @property
     def information(self) -> Information:
@@ -110,7 +110,9 @@ class RankFindings:
 
 
 def find_redundancy(
-    information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = _RANK_TOLERANCE
+    information: Information,
+    nominal_values: Float64[np.ndarray, " parameters"],
+    tolerance: float = _RANK_TOLERANCE,
 ) -> Redundancy:
     """Find the rank, an identifiable subset of the parameters, and the dependencies of the other parameters on it.
 
@@ -119,12 +121,12 @@ def find_redundancy(
 
     Args:
         information: the condensed Jacobian.
-        sizes: nominal values. Of parameters with equal columns, the one with the larger value is kept: of parallel
-            axes, the d that is a real offset.
+        nominal_values: nominal values. Of parameters with equal columns, the one with the larger value is kept: of
+            parallel axes, the d that is a real offset.
         tolerance: see `_RANK_TOLERANCE`.
     """
     jacobian, names = information.jacobian, np.array(information.names)
-    lengths, preference = _lengths(jacobian), selection_weights(information.parameters, sizes)
+    lengths, preference = _lengths(jacobian), selection_weights(information.parameters, nominal_values)
     scale = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
     triangle, pivots = pivoted_qr(jacobian * scale)
     rank = _rank(triangle / preference[pivots], tolerance)
@@ -168,11 +170,13 @@ def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
 
 
 def selection_weights(
-    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
+    parameters: Sequence[Parameter], nominal_values: Float64[np.ndarray, " parameters"]
 ) -> Float64[np.ndarray, " parameters"]:
     """Compute the weights by which parameters are selected; of parameters with equal weights, the first is kept."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
-    result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
+    result: np.ndarray = weights * (
+        1 + 1e-3 * (np.abs(nominal_values) > 1e-9) - 1e-6 * np.arange(len(weights))
+    )
     return result
 
 

@@ -63,38 +63,44 @@ _SOCKETS_WITHOUT_SCALE = (
 )
 
 
-def free_parameters(redundancy: Redundancy, named_individually: bool, unknowns: int) -> int:
+def count_estimated_unknowns(
+    redundancy: Redundancy, named_individually: bool, sensor_unknown_count: int
+) -> int:
     """Return the number of unknowns to estimate.
 
     Args:
         redundancy: redundancy of the candidates at the start.
         named_individually: whether the candidates were named individually.
-        unknowns: number of the sensors' unknowns, such as the positions of sockets.
+        sensor_unknown_count: number of the sensors' unknowns, such as the positions of sockets.
     """
     acting = len(redundancy.names) - len(redundancy.no_effect)
-    return (acting if named_individually else redundancy.rank) + unknowns
+    return (acting if named_individually else redundancy.rank) + sensor_unknown_count
 
 
 def refuse_too_few(
-    problem: CalibrationProblem, redundancy: Redundancy, named_individually: bool, unknowns: int, source: str
+    problem: CalibrationProblem,
+    redundancy: Redundancy,
+    named_individually: bool,
+    sensor_unknown_count: int,
+    source: str,
 ) -> None:
     """Refuse data that are too few to determine the free parameters.
 
     Args:
         problem: rows and sensors.
-        redundancy: see `free_parameters`.
-        named_individually: see `free_parameters`.
-        unknowns: see `free_parameters`.
+        redundancy: see `count_estimated_unknowns`.
+        named_individually: see `count_estimated_unknowns`.
+        sensor_unknown_count: see `count_estimated_unknowns`.
         source: name of the data in error messages.
 
     Raises:
         IdentificationError: there are not more values than parameters.
     """
     values = distinct_values(problem)
-    if values > free_parameters(redundancy, named_individually, unknowns):
+    if values > count_estimated_unknowns(redundancy, named_individually, sensor_unknown_count):
         return
     # The rank cannot be used, because it is at most the number of values.
-    most = free_parameters(redundancy, True, unknowns)
+    most = count_estimated_unknowns(redundancy, True, sensor_unknown_count)
     raise IdentificationError(
         f"expected more values than the {most} free parameters, got {values} values from {distinct_rows(problem)} "
         "different poses",
@@ -105,20 +111,20 @@ def refuse_too_few(
     )
 
 
-def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[CalibrationWarning, ...]:
+def measurement_advice(setup: CalibrationSetup, estimated_count: int) -> tuple[CalibrationWarning, ...]:
     """Return warnings about free parameters that the data hardly determine, with advice on what to measure next.
 
     Args:
         setup: the problem at its start.
-        estimated: number of unknowns to estimate.
+        estimated_count: number of unknowns to estimate.
     """
     problem = setup.problem
     values = distinct_values(problem)
     few = []
-    if values < _GOOD_RATIO * estimated:
+    if values < _GOOD_RATIO * estimated_count:
         sentence = (
-            f"there are only {values} values for {estimated} free parameters; measure about "
-            f"{_missing_poses(problem, estimated)} more poses."
+            f"there are only {values} values for {estimated_count} free parameters; measure about "
+            f"{_missing_poses(problem, estimated_count)} more poses."
         )
         few.append(CalibrationWarning("few_values", "", sentence))
     robot = problem.space.robot
@@ -130,9 +136,9 @@ def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[Calibra
     )
 
 
-def _missing_poses(problem: CalibrationProblem, estimated: int) -> int:
+def _missing_poses(problem: CalibrationProblem, estimated_count: int) -> int:
     values = distinct_values(problem)
-    return int(np.ceil((_GOOD_RATIO * estimated - values) / (values / max(distinct_rows(problem), 1))))
+    return int(np.ceil((_GOOD_RATIO * estimated_count - values) / (values / max(distinct_rows(problem), 1))))
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
@@ -143,7 +149,7 @@ def distinct_rows(problem: CalibrationProblem) -> int:
 def distinct_values(problem: CalibrationProblem) -> int:
     """Return the number of measured values, with repeats counted once."""
     share = distinct_rows(problem) / problem.q.shape[0]
-    return round(sum(problem.values_measured) * share)
+    return round(sum(problem.measured_value_counts) * share)
 
 
 def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
@@ -208,7 +214,7 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     return any(max(values) - min(values) > _SAME_FACE for values in faces.values())
 
 
-def candidates_at_start(
+def information_at_start(
     setup: CalibrationSetup, candidates: list[int], information: Information
 ) -> tuple[list[int], Information]:
     """Compute the information on the candidates at the start, with the sensors' unknowns eliminated.

@@ -118,15 +118,15 @@ def starts_from_positions(
 ) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
     """Yield starts for `position = R_base (R_flange · point + p_flange) + p_base`, to refine and compare.
 
-    The first start is from `start_from_products`, if there are enough rows. The others assume a point (the nominal
-    point, zero, a tenth of the reach along each axis) and fit the base by Procrustes analysis, for singular linear
-    systems, for example of parallel axes or few rows.
+    The first start is from `start_from_linear_equations`, if there are enough rows. The others assume a point (the
+    nominal point, zero, a tenth of the reach along each axis) and fit the base by Procrustes analysis, for singular
+    linear systems, for example of parallel axes or few rows.
 
     Yields:
         R_base, p_base [m], point [m].
     """
     if position.shape[0] >= _LINEAR_ROWS:
-        yield start_from_products(R_flange, p_flange, position, nominal_point)
+        yield start_from_linear_equations(R_flange, p_flange, position, nominal_point)
     along = 0.1 * reach * torch.eye(3).to(position)
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
     for point in assumed.unbind():
@@ -134,7 +134,7 @@ def starts_from_positions(
         yield *fit_base_to_points(arm, position), point
 
 
-def start_from_products(
+def start_from_linear_equations(
     R_flange: Float64[Tensor, "rows 3 3"],
     p_flange: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],

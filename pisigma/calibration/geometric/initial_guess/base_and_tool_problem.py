@@ -197,8 +197,8 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
 
 def _view_of(linearisation: Linearisation[BaseToolState]) -> _View:
-    assert isinstance(linearisation.detail, _View)
-    return linearisation.detail
+    assert isinstance(linearisation.problem_data, _View)
+    return linearisation.problem_data
 
 
 def build_base_and_tool_problem(

@@ -131,7 +131,7 @@ def information(
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
     root = blocks[0].t().cpu().numpy() * usual
-    return Information(parameters, root, sum(problem.values_measured), int(present.sum()))
+    return Information(parameters, root, sum(problem.measured_value_counts), int(present.sum()))
 
 
 def _row_weights(

@@ -50,7 +50,7 @@ def with_joint_repeatability(
     return with_pose_noise(rows, covariance)
 
 
-def corner_factor(rows: Measurements, noise: float) -> float:
+def corner_sigma_factor(rows: Measurements, noise: float) -> float:
     """Return the factor on the standard deviations that images state, from the estimated noise of a corner [m].
 
     Deviations of joints relative to those that images state are multiplied by it.

@@ -51,7 +51,7 @@ class Linearisation(Generic[Point]):
         normal: half the Gauss-Newton Hessian of the cost, whose inverse is the covariance of the unknowns.
         misfit: part of the cost due to the data; the remainder is due to the prior.
         rounding: misfit that can be caused by rounding errors alone.
-        detail: further data that the problem stores for later calls.
+        problem_data: further data that the problem stores for later calls.
     """
 
     point: Point
@@ -60,7 +60,7 @@ class Linearisation(Generic[Point]):
     normal: Float[Tensor, "unknowns unknowns"]
     misfit: Float[Tensor, ""]
     rounding: Float[Tensor, ""]
-    detail: object
+    problem_data: object
 
 
 class AbstractLeastSquares(ABC, Generic[Point]):
@@ -119,7 +119,7 @@ def levenberg_marquardt(
     problem: AbstractLeastSquares[Point],
     start: Point | Linearisation[Point],
     maximum_iterations: int = 50,
-    close_enough: float = 0.0,
+    step_tolerance: float = 0.0,
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
 
@@ -134,7 +134,8 @@ def levenberg_marquardt(
         problem: the problem to minimise.
         start: start point, or the problem linearised at the start point.
         maximum_iterations: maximum number of steps.
-        close_enough: length of a step [standard errors] below which the step is not taken and the search has converged.
+        step_tolerance: length of a step [standard errors] below which the step is not taken and the search has
+            converged.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
@@ -148,7 +149,7 @@ def levenberg_marquardt(
     status: SolutionStatus | None = None
     while status is None and search.iterations < maximum_iterations:
         search.propose_step()
-        near = search.at_best and search.decrement < close_enough**2
+        near = search.at_best and search.decrement < step_tolerance**2
         status = SolutionStatus.CONVERGED if near else search.try_step()
     ended = status or SolutionStatus.ITERATION_LIMIT
     return Solution(search.best, search.iterations, ended, tuple(search.path))

@@ -114,11 +114,11 @@ class SensorView:
 
 def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
     """Return the contributions of the sensors in a linearisation of a `CalibrationProblem`."""
-    assert isinstance(linearisation.detail, SensorView)
-    return linearisation.detail
+    assert isinstance(linearisation.problem_data, SensorView)
+    return linearisation.problem_data
 
 
-def parameters_by_sensor(
+def effective_parameters_by_sensor(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
     """Compute the effective number of parameters that are estimated from every sensor's values (Förstner 1979)."""
@@ -311,7 +311,7 @@ def _group_squares(
     return torch.where(measured, squares, 0.0).sum(), measured.sum() * components
 
 
-def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
+def repeat_indices(q: Tensor, *names: Tensor) -> Tensor | None:
     """Return an index for every row that is equal for equal joint values (with payload) and names.
 
     Returns:

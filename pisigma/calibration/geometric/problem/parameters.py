@@ -267,7 +267,7 @@ class ParameterSpace:
             for own in self.unknowns
         }
 
-    def positions_of(
+    def indices_in_group(
         self, group: str, active: Int64[Tensor, " active"]
     ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
         """Return position, owner's index and column of the active parameters in a group of unknowns."""

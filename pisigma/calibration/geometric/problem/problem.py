@@ -18,10 +18,10 @@ from pisigma.calibration.geometric.problem.noise import (
     SensorContribution,
     SensorView,
     angle_disagreement,
+    effective_parameters_by_sensor,
     group_variance_ratio,
     joined_contributions,
     loss_scale,
-    parameters_by_sensor,
     rejects_rows,
     renumber,
     sensor_view_of,
@@ -94,7 +94,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.q.shape[0]
 
     @cached_property
-    def values_measured(self) -> tuple[int, ...]:
+    def measured_value_counts(self) -> tuple[int, ...]:
         """Number of values of every sensor."""
         return tuple(int(sensor.present.sum()) * sensor.components for sensor in self.sensors)
 
@@ -189,7 +189,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     ) -> tuple[Linearisation[Tensor], bool]:
         view = sensor_view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
-        used = parameters_by_sensor(view, covariance)
+        used = effective_parameters_by_sensor(view, covariance)
         noise = loss_scale(self.sensors, self.loss, view, used, refine)
         repetition = view.repeat_variance_factor
         if self.pose is not None or self.configuration is not None:
@@ -283,7 +283,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Compute the derivative of a sensor's values with respect to the parameters of the motion."""
         J = sensor.derivative(motion, unknowns, rows)
         for block in sensor.unknown_derivatives(motion, unknowns, rows):
-            positions, owner, column = self.space.positions_of(block.group, active)
+            positions, owner, column = self.space.indices_in_group(block.group, active)
             if len(positions):
                 theirs = (owner[:, None] == block.owner)[:, None, :]
                 J = J.index_add(0, positions, block.derivative[column] * theirs)
@@ -326,7 +326,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _rounding(self) -> Float64[Tensor, " sensors"]:
         """Sum of squared residuals that rounding errors cause, per sensor [m² or rad²]."""
         sizes = (self.space.robot.reach if sensor.unit == "m" else 1.0 for sensor in self.sensors)
-        pairs = zip(self.values_measured, sizes, strict=True)
+        pairs = zip(self.measured_value_counts, sizes, strict=True)
         epsilon = torch.finfo(self.q.dtype).eps
         return self.q.new_tensor([values * (epsilon * size) ** 2 for values, size in pairs])
 
@@ -344,7 +344,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Whether every sensor has a value in all rows, per sensor."""
         return tuple(
             values == self.rows * sensor.components
-            for values, sensor in zip(self.values_measured, self.sensors, strict=True)
+            for values, sensor in zip(self.measured_value_counts, self.sensors, strict=True)
         )
 
     def _sums(
@@ -374,5 +374,5 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         torch.mul(J, root, out=A[:-1])
         torch.mul(residual, root, out=A[-1])
         A = A.flatten(1)
-        sums, measured = A @ A.mT, self.values_measured[number] // sensor.components
+        sums, measured = A @ A.mT, self.measured_value_counts[number] // sensor.components
         return SensorContribution(sums[:-1, :-1], sums[:-1, -1], residual, distance, measured)

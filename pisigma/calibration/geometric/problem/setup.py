@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
 from pisigma.calibration.geometric.problem.joint_repeatability import with_joint_repeatability
-from pisigma.calibration.geometric.problem.noise import number_repeats
+from pisigma.calibration.geometric.problem.noise import repeat_indices
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorScaling
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.estimation.loss import AbstractLoss
@@ -30,7 +30,7 @@ from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, tran
 
 
 @dataclass(frozen=True, eq=False)
-class Anchors:
+class ReferenceFrames:
     """Start values of bases and tools; parameters are relative to them, far from the singularity of roll, pitch, yaw.
 
     Attributes:
@@ -55,7 +55,7 @@ class CalibrationSetup:
     Attributes:
         problem: the problem, not yet with free parameters.
         start: start values of all parameters.
-        anchors: frames to which bases and tools are relative.
+        reference_frames: frames to which bases and tools are relative.
         row_indices: indices of the problem's rows in the measurements, in the order of the problem.
         unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
         free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
@@ -66,7 +66,7 @@ class CalibrationSetup:
 
     problem: CalibrationProblem
     start: Float64[Tensor, " parameters"]
-    anchors: Anchors
+    reference_frames: ReferenceFrames
     row_indices: Tensor
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
     free_unknowns: list[int]
@@ -90,7 +90,9 @@ class CalibrationSetup:
 
     def corner_sensor(self, rows: Measurements) -> CornerSensor | None:
         """Return the images in the rows of the problem, with the weights that these state; None without images."""
-        return CornerSensor.build(self.anchors.sensor_rows(rows, self.problem.frame, self.problem.target))
+        return CornerSensor.build(
+            self.reference_frames.sensor_rows(rows, self.problem.frame, self.problem.target)
+        )
 
 
 @dataclass(frozen=True)
@@ -173,11 +175,11 @@ def setup_from_guess(
     unknown_frames = {
         own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
     }
-    anchors, start = _anchored(space, initial_guess, options, unknown_frames)
+    reference_frames, start = _anchored(space, initial_guess, options, unknown_frames)
     if dh is not None:
         start[: space.arm_parameter_count] = torch.from_numpy(dh.flatten())
     start = start.to(device)
-    sensors = build_sensors(anchors.sensor_rows(measurements, frame, target))
+    sensors = build_sensors(reference_frames.sensor_rows(measurements, frame, target))
     distances = SocketDistanceSensor.assign_distances(
         measurements, options.socket_distances, options.socket_sigma
     )
@@ -192,8 +194,8 @@ def setup_from_guess(
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
-        pose=number_repeats(repeats, frame, target),
-        configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
+        pose=repeat_indices(repeats, frame, target),
+        configuration=repeat_indices(repeats, frame) if len(space.targets) > 1 else None,
         pair_count=len(set(measurements.pair or ()) - {""}),
         stated_conditions=JointState.from_measurements(measurements).conditions,
         prior_scaling=options.prior_scaling,
@@ -204,7 +206,14 @@ def setup_from_guess(
         for index in initial_guess.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
     ]
     setup = CalibrationSetup(
-        problem, start, anchors, rows, unknown_frames, free, measurements, options.joint_repeatability
+        problem,
+        start,
+        reference_frames,
+        rows,
+        unknown_frames,
+        free,
+        measurements,
+        options.joint_repeatability,
     )
     return setup.weighted_at(start)
 
@@ -247,25 +256,31 @@ def _anchored(
     guessed: InitialGuess,
     options: SetupOptions,
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]],
-) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
+) -> tuple[ReferenceFrames, Float64[Tensor, " parameters"]]:
     """Return the anchors, and the start relative to them: the identity for free bases and free tool rotations."""
     bases, tools = guessed.bases.copy(), guessed.tools.copy()
-    anchors = Anchors(
+    reference_frames = ReferenceFrames(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
     )
     if options.free_base:
-        anchors = Anchors(transform_from_xyzrpy(torch.from_numpy(bases)), anchors.tools)
+        reference_frames = ReferenceFrames(
+            transform_from_xyzrpy(torch.from_numpy(bases)), reference_frames.tools
+        )
         bases = np.zeros_like(bases)
     if options.free_tool:
-        anchors = Anchors(anchors.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
+        reference_frames = ReferenceFrames(
+            reference_frames.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:]))
+        )
         tools[:, 3:] = 0
     unknowns = {
         own.name: _moved(
-            invert(anchors.bases)[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point
+            invert(reference_frames.bases)[unknown_frames[own.name]],
+            guessed.unknowns[own.name],
+            own.has_point,
         ).numpy()
         for own in space.unknowns
     }
-    return anchors, space.values(bases, tools, unknowns)
+    return reference_frames, space.values(bases, tools, unknowns)
 
 
 def _moved(
@@ -338,7 +353,7 @@ def in_user_coordinates(
 ) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, "frames 6"], Float64[np.ndarray, "targets 6"]]:
     """Return rows, bases and tools at a point of the problem, in the user's coordinates."""
     dh, bases, tools = (block.clone() for block in setup.problem.space.split(point.cpu()))
-    T_anchor, R_tool = setup.anchors.bases.cpu(), setup.anchors.tools.cpu()
+    T_anchor, R_tool = setup.reference_frames.bases.cpu(), setup.reference_frames.tools.cpu()
     R_anchor = T_anchor[:, :3, :3]
     bases[:, 3:] = rpy_from_rotation(R_anchor @ rotation_from_rpy(bases[:, 3:]))
     bases[:, :3] = (R_anchor @ bases[:, :3, None])[..., 0] + T_anchor[:, :3, 3]
@@ -355,11 +370,11 @@ def coordinate_change(
         setup: setup with the anchors to which bases and tools of the problem are relative.
         point: point of the derivative, in the problem's coordinates.
     """
-    space, anchors = setup.problem.space, setup.anchors
+    space, reference_frames = setup.problem.space, setup.reference_frames
     _, bases, tools = space.split(point)
     _, user_bases, user_tools = (torch.from_numpy(block) for block in in_user_coordinates(setup, point))
     change = torch.eye(len(point), dtype=point.dtype)
-    for k, anchor in enumerate(anchors.bases.cpu()):
+    for k, anchor in enumerate(reference_frames.bases.cpu()):
         first = space.indices_of("base").start + 6 * k
         # Shifts of a base are in the axes of its anchor.
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
@@ -377,7 +392,7 @@ def coordinate_change(
         if own.has_point:
             for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
                 first = space.indices_of(own.name).start + len(own.columns) * k
-                change[first : first + 3, first : first + 3] = anchors.bases[number, :3, :3].cpu()
+                change[first : first + 3, first : first + 3] = reference_frames.bases[number, :3, :3].cpu()
     return change
 
 
@@ -385,7 +400,7 @@ def unknowns_in_frames(
     setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
 ) -> dict[str, Float64[np.ndarray, "owners columns"]]:
     """Return the sensors' unknowns at a point of the problem by group, in the frames of their owners."""
-    space, bases = setup.problem.space, setup.anchors.bases.cpu()
+    space, bases = setup.problem.space, setup.reference_frames.bases.cpu()
     values = space.sensor_unknowns(point.cpu())
     return {
         own.name: _moved(bases[setup.unknown_frames[own.name]], values[own.name].t(), own.has_point).numpy()

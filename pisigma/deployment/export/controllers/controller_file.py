@@ -64,20 +64,20 @@ class Convention:
     Attributes:
         nominal: robot of the controller without the file, in its frames and parameters.
         frames: frames of the controller relative to frames of the robot description; None if they are equal.
-        published: values published by the manufacturer or a user with which the file was tested, and their source; None
-            if there are none.
+        published_values: values published by the manufacturer or a user with which the file was tested, and their
+            source; None if there are none.
     """
 
     nominal: Robot
     frames: Frames | None = None
-    published: str | None = None
+    published_values: str | None = None
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return sentences on the tests of the file and the frames of its poses."""
         tried = (
-            f"Reading and writing were tested against {self.published}."
-            if self.published
+            f"Reading and writing were tested against {self.published_values}."
+            if self.published_values
             else f"No published values were found to test this file for robot '{self.nominal.name}': compare the "
             "controller's position with that of pisigma at several joint values before you use it."
         )
@@ -92,7 +92,7 @@ class ControllerFile:
         name: name of the `--format`.
         contents: contents of a file, with an article.
         suffixes: suffixes of its files.
-        source: sentence on the source of the format and its tests; see `untested_on_controller`.
+        source: sentence on the source of the format and its tests; see `untested_sentence`.
         convention: function that returns the controller's description of a robot, or raises a `PisigmaError` if there
             is none.
         requirements: sentences on what the file requires of the controller.
@@ -171,7 +171,7 @@ class ControllerFile:
         return Exported(text, model_facts(model) | facts, tuple(sentences))
 
 
-def untested_on_controller(source: str) -> str:
+def untested_sentence(source: str) -> str:
     """Return the sentence about a file that was not tested on a controller."""
     return f"Written from the published description ({source}), not tested on a controller."
 

@@ -9,7 +9,7 @@ from pisigma.deployment.export.approximation import joint_offsets
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileContent,
-    untested_on_controller,
+    untested_sentence,
 )
 from pisigma.deployment.export.controllers.reading import read_offsets
 from pisigma.deployment.export.dh_table import csv_table, parameter_columns
@@ -123,7 +123,7 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         name=name,
         contents=contents,
         suffixes=(".csv",),
-        source=untested_on_controller(source),
+        source=untested_sentence(source),
         requirements=(meaning, *_SIGN),
         text=write_counts,
         read=read_offsets,

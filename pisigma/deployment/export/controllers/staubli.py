@@ -9,7 +9,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     FileContent,
     check_plain_joints,
     frame_sentences,
-    untested_on_controller,
+    untested_sentence,
     with_frames,
 )
 from pisigma.files.errors import Place, RobotError
@@ -127,7 +127,7 @@ FILE = ControllerFile(
     name="staubli",
     contents="the dhOffset of a Staubli arm.cfx",
     suffixes=(".cfx",),
-    source=untested_on_controller("github.com/ros-industrial/staubli_experimental/issues/35"),
+    source=untested_sentence("github.com/ros-industrial/staubli_experimental/issues/35"),
     requirements=(
         "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
         "description. Its order of multiplication is not published; RotZ(theta) Trans(a, b, d) RotX(alpha) RotY(beta) "

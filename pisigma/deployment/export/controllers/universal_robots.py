@@ -9,7 +9,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileContent,
     frame_sentences,
-    untested_on_controller,
+    untested_sentence,
     with_frames,
 )
 from pisigma.deployment.export.controllers.ur_models import (
@@ -122,7 +122,7 @@ FILE = ControllerFile(
     name="ur-calibration",
     contents="the calibration.conf of a Universal Robots controller",
     suffixes=(".conf",),
-    source=untested_on_controller("forum.universal-robots.com/t/18921 and /t/1638"),
+    source=untested_sentence("forum.universal-robots.com/t/18921 and /t/1638"),
     requirements=(
         "The controller adds these differences to its own nominal DH parameters, which are in urcontrol.conf.",
         "The file includes neither base nor tool. The line 'base' below is the pose of the controller's frame 'base' "

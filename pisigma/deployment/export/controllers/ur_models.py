@@ -140,35 +140,39 @@ def _frame_words(T: Frame) -> str:
     return ", ".join(lengths + turns)
 
 
-def controller_geometry(described: Robot) -> ControllerGeometry:
+def controller_geometry(described_robot: Robot) -> ControllerGeometry:
     """Return the Universal Robots model to which a nominal or calibrated robot belongs, and its relative frames.
 
     Raises:
         RobotError: the robot is not a known model.
     """
-    check_robot(described)
-    candidates = [_placed(model, _robot(described, model), described) for model in _D_AND_A]
+    check_robot(described_robot)
+    candidates = [_placed(model, _robot(described_robot, model), described_robot) for model in _D_AND_A]
     distance, own = min(candidates, key=lambda candidate: candidate[0])
     if distance <= _FARTHEST:
         return own
-    if _has_own_convention(described):
-        plain = described.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+    if _has_own_convention(described_robot):
+        plain = described_robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
         return ControllerGeometry(
-            described.name, plain, frame_of(described.base), frame_of(described.tool), described
+            described_robot.name,
+            plain,
+            frame_of(described_robot.base),
+            frame_of(described_robot.tool),
+            described_robot,
         )
     raise RobotError(
-        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{described.name}', whose tool is on "
-        f"average {distance * 1e3:.3g} mm from that of a {own.model}",
+        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{described_robot.name}', whose tool "
+        f"is on average {distance * 1e3:.3g} mm from that of a {own.model}",
         expected="an arm of Universal Robots",
-        value=described.name,
+        value=described_robot.name,
         remedy="for another arm of Universal Robots, give a robot file with the maker's DH parameters (theta 0, a "
         "negative, alpha 90, 0, 0, 90, -90, 0 deg)",
     )
 
 
-def convention(described: Robot) -> Convention:
+def convention(described_robot: Robot) -> Convention:
     """Return the controller's description of an arm, and the values with which its files were tested."""
-    own = controller_geometry(described)
+    own = controller_geometry(described_robot)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
         values.append(f"the maker's default kinematics and hash of the {own.model} ({_DEFAULTS})")
@@ -184,12 +188,12 @@ def check_robot(robot: Robot) -> None:
     check_plain_joints(robot, "a file of Universal Robots", JOINTS)
 
 
-def _robot(described: Robot, model: str) -> Robot:
+def _robot(described_robot: Robot, model: str) -> Robot:
     """Return the nominal robot of a model with the names and limits of a description."""
     (d_1, *wrist), (a_2, a_3) = _D_AND_A[model]
     dh = np.zeros((JOINTS, 5))
     dh[:, 1], dh[:, 2], dh[:, 3] = (d_1, 0, 0, *wrist), (0, -a_2, -a_3, 0, 0, 0), _ALPHA
-    return described.with_geometry(dh, np.zeros(6), np.zeros(6))
+    return described_robot.with_geometry(dh, np.zeros(6), np.zeros(6))
 
 
 def _has_own_convention(robot: Robot) -> bool:
@@ -200,11 +204,11 @@ def _has_own_convention(robot: Robot) -> bool:
     )
 
 
-def _placed(model: str, own: Robot, described: Robot) -> tuple[float, ControllerGeometry]:
+def _placed(model: str, own: Robot, described_robot: Robot) -> tuple[float, ControllerGeometry]:
     """Align a model with a description, and return the mean distance [m] between their tools."""
-    base, tool = _by_first_axes(own, described)
+    base, tool = _by_first_axes(own, described_robot)
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
-    T = forward_kinematics(described, q)
+    T = forward_kinematics(described_robot, q)
 
     def described_with(base: Frame, tool: Frame) -> tuple[float, Robot]:
         robot = own.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
@@ -215,12 +219,12 @@ def _placed(model: str, own: Robot, described: Robot) -> tuple[float, Controller
         robot, _ = solve_approximation(ApproximationProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
         distance, robot = described_with(base, tool)
-    return distance, ControllerGeometry(model, own, base, tool, described)
+    return distance, ControllerGeometry(model, own, base, tool, described_robot)
 
 
-def _by_first_axes(own: Robot, described: Robot) -> tuple[Frame, Frame]:
+def _by_first_axes(own: Robot, described_robot: Robot) -> tuple[Frame, Frame]:
     """Determine the controller's base from axes 1 and 2, and the description's tool on the flange at zero."""
-    first, second = _zero_frames(described)[:2]
+    first, second = _zero_frames(described_robot)[:2]
     z, across = first[:3, 2], second[:3, 2] - first[:3, 2] * (second[:3, 2] @ first[:3, 2])
     base = np.eye(4)
     if np.linalg.norm(across) > _EXACT:
@@ -232,7 +236,7 @@ def _by_first_axes(own: Robot, described: Robot) -> tuple[Frame, Frame]:
     base[:3, 3] = first[:3, 3] + (along - own.dh[0, 1]) * z
     base = _clean(base)
     zero = torch.zeros(1, JOINTS, dtype=torch.float64)
-    ends = [forward_kinematics(robot, zero)[0].numpy() for robot in (own, described)]
+    ends = [forward_kinematics(robot, zero)[0].numpy() for robot in (own, described_robot)]
     return base, _clean(inverse(base @ ends[0]) @ ends[1])
 
 

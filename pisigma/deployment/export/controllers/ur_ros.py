@@ -7,7 +7,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileContent,
     frame_sentences,
-    untested_on_controller,
+    untested_sentence,
     with_frames,
 )
 from pisigma.deployment.export.controllers.universal_robots import without_beta
@@ -152,7 +152,7 @@ FILE = ControllerFile(
     name="ur-ros",
     contents="the kinematics YAML of Universal Robots' ROS driver",
     suffixes=(".yaml", ".yml"),
-    source=untested_on_controller(
+    source=untested_sentence(
         "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
     ),
     requirements=(

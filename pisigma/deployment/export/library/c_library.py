@@ -18,7 +18,7 @@ from pisigma.files.errors import OutputError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.compiled_model import describe_as_arrays
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.joint_input import Postures
+from pisigma.model.inverse.joint_input import PlausibleJoints
 from pisigma.robot.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.robot.kernels.build import source_hash
 from pisigma.robot.kernels.layout import DESCRIPTION, DOF, MEMORY, pack
@@ -60,7 +60,7 @@ def _link(code: bytes, compiler: str) -> bytes:
     """
     sources = Path(__file__).parent
     sizes = {
-        "LAYOUT": f"{library_key()}ULL",
+        "LAYOUT": f"{library_source_hash()}ULL",
         "DESCRIPTION_SIZE": DESCRIPTION.itemsize,
         "MEMORY_SIZE": MEMORY.itemsize,
     }
@@ -94,7 +94,7 @@ FORMAT = ExportFormat(
 )
 
 
-def library_key() -> int:
+def library_source_hash() -> int:
     """Return the first 64 bits of the hash of the sources, by which a library recognises its model files."""
     return int(source_hash()[:16], 16)
 
@@ -111,12 +111,12 @@ def model_file(model: CalibratedModel) -> bytes:
     compiled = CompiledIK.from_model(model)
     description, branches = compiled.description, compiled.branches
     packed = pack(description, model.name, kernel_forms(description.forms))
-    postures = Postures(
+    plausible_joints = PlausibleJoints(
         model.robot.limits, np.array(model.robot.revolute), [j.name for j in model.robot.joints]
     )
     bounds = np.zeros((2, DOF))
     for row, infinity in enumerate((-np.inf, np.inf)):
-        bounds[row, : model.robot.dof] = postures.clip(np.full(model.robot.dof, infinity))
+        bounds[row, : model.robot.dof] = plausible_joints.clip(np.full(model.robot.dof, infinity))
     names = b"".join(name.encode() + b"\0" for name in branches)
     arm = -1 if description.network.used else CORRECTED if description.arms.corrected else IDENTIFIED
     segments = _segments(packed)
@@ -124,7 +124,7 @@ def model_file(model: CalibratedModel) -> bytes:
     axes = np.zeros(8)
     axes[: compiled.task_axes.row.size] = compiled.task_axes.row.ravel()
     head = _HEAD.pack(
-        b"PSIGIK01", library_key(), *sizes, arm, *bounds.ravel(), len(compiled.task_axes.row), *axes
+        b"PSIGIK01", library_source_hash(), *sizes, arm, *bounds.ravel(), len(compiled.task_axes.row), *axes
     )
     content = head + names + b"".join(segments)
     return content + struct.pack("=I", zlib.crc32(content))

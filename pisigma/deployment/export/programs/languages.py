@@ -13,11 +13,11 @@ from torch import Tensor
 from pisigma.deployment.export.programs.targets import Targets
 from pisigma.deployment.export.programs.text import (
     comments,
-    labelled,
+    format_labelled,
+    format_numbers,
     metres_and_rotation_vector,
-    millimetres,
     millimetres_and_euler,
-    numbers,
+    position_in_mm,
     quaternion,
 )
 from pisigma.files.errors import OutputError, Place
@@ -163,10 +163,10 @@ _NUMBERED_LINE = re.compile(r"(?m)^ *\d+:")
 @functools.cache
 def _templates() -> jinja2.Environment:
     filters = (
-        numbers,
-        labelled,
+        format_numbers,
+        format_labelled,
         comments,
-        millimetres,
+        position_in_mm,
         millimetres_and_euler,
         metres_and_rotation_vector,
         quaternion,

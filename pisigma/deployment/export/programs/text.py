@@ -15,21 +15,23 @@ DIGITS = 6
 Radians, metres and quaternions have 9."""
 
 
-def numbers(values: Iterable[float], digits: int = DIGITS) -> str:
+def format_numbers(values: Iterable[float], digits: int = DIGITS) -> str:
     """Format numbers with ", " between them; see `number`."""
-    return ", ".join(number(value, digits) for value in values)
+    return ", ".join(format_number(value, digits) for value in values)
 
 
-def number(value: float, digits: int) -> str:
+def format_number(value: float, digits: int) -> str:
     """Format a number with a decimal point, without an exponent and without a sign of zero."""
     assert math.isfinite(value), "a program has finite numbers only"
     written = f"{value:.{digits}f}"
     return written.removeprefix("-") if not float(written) else written
 
 
-def labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> str:
+def format_labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> str:
     """Format numbers with labels and units, such as `X 1.000000, Y 2.000000`."""
-    return ", ".join(f"{label} {number(v, DIGITS)}{unit}" for label, v in zip(labels, values, strict=True))
+    return ", ".join(
+        f"{label} {format_number(v, DIGITS)}{unit}" for label, v in zip(labels, values, strict=True)
+    )
 
 
 def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
@@ -42,7 +44,7 @@ def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
     return "\n".join(lines)
 
 
-def millimetres(T: Float64[Tensor, "*batch 4 4"]) -> list[float]:
+def position_in_mm(T: Float64[Tensor, "*batch 4 4"]) -> list[float]:
     """Return x, y, z [mm]."""
     position: list[float] = (T[..., :3, 3] * 1e3).tolist()
     return position

@@ -76,34 +76,34 @@ class ActiveFrames:
         """Return the value of a name, or the reason why it is uncertain."""
         return self._values[name]
 
-    def advance(self, number: int, value: Frame | str = "") -> None:
+    def advance_past(self, step_index: int, value: Frame | str = "") -> None:
         """Advance past a statement.
 
         Args:
-            number: index of the step.
+            step_index: index of the step.
             value: value of a "set", or the reason why it is unknown.
         """
-        step = self._steps[number]
+        step = self._steps[step_index]
         if step.kind == "set":
             self._values[step.name] = (
-                f"{step.name} {DEPENDS_ON_PATH}" if self._is_reached_twice(number) else value
+                f"{step.name} {DEPENDS_ON_PATH}" if self._is_reached_twice(step_index) else value
             )
         elif step.kind == "call":
             where = "is" if step.name in self._set_by else "may be"
             whose = "" if step.name in self._set_by else " of another file"
-            for name in self._set_at(number):
+            for name in self._set_at(step_index):
                 self._values[name] = f"{name} {where} set by the routine {step.name}{whose}"
         elif step.kind == "else" and self._saved:
             self._values = dict(self._saved[-1])
             # calls in a condition also affect the following parts
-            begin = self._open[number][-1] if self._open[number] else number
+            begin = self._open[step_index][-1] if self._open[step_index] else step_index
             self._doubt(self._set_in(begin, ("call",)), DEPENDS_ON_PATH)
         elif step.kind == "end":
-            self._end(number)
+            self._end(step_index)
         elif step.kind in ("routine", "loop", "branch"):
             self._saved.append(dict(self._values))
             if step.kind == "loop":
-                self._doubt(self._set_in(number), DEPENDS_ON_PATH)
+                self._doubt(self._set_in(step_index), DEPENDS_ON_PATH)
             elif step.kind == "routine":
                 self._doubt(self._set_elsewhere(step.name), DEPENDS_ON_CALLER)
 

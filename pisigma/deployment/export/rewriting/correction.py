@@ -45,7 +45,7 @@ class CorrectedProgram:
     Attributes:
         text: text of the program.
         statuses: line and status of every target.
-        waypoints: number of inserted waypoints.
+        waypoint_count: number of inserted waypoints.
         unchanged_lines: line of every target that was not changed, and the reason.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
@@ -53,13 +53,13 @@ class CorrectedProgram:
 
     text: str
     statuses: tuple[tuple[int, Status], ...]
-    waypoints: int
+    waypoint_count: int
     unchanged_lines: tuple[tuple[int, str], ...]
     largest_shift: float
     branches: tuple[str, ...]
 
     @property
-    def unreached(self) -> tuple[tuple[int, Status], ...]:
+    def unreached_lines(self) -> tuple[tuple[int, Status], ...]:
         """Line and status of targets that were not changed."""
         return tuple((line, status) for line, status in self.statuses if status not in WITH_TARGET)
 
@@ -111,7 +111,7 @@ class ProgramCorrection:
         joint values. A straight move is split where the line between two of these poses deviates from the corrected
         line by more than the tolerance; an arc is split into arcs in the same way.
         """
-        targets, ways = program.targets, {move: self.path(move) for move in program.moves}
+        targets, ways = program.targets, {move: self.path_points(move) for move in program.moves}
         paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
         answers = self.commanded_poses(
             [*targets, *(move.end for move in paths)],
@@ -156,7 +156,7 @@ class ProgramCorrection:
             for T, status, branch in zip(*split, strict=True)
         ]
 
-    def path(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
+    def path_points(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
         """Return the path of the end's tool in the end's frame, or the reason why it is unknown."""
         if move.start is None or (move.circular and move.via is None):
             what = "start or via point" if move.circular else "start"

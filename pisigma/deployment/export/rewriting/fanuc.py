@@ -9,7 +9,7 @@ from itertools import count
 
 import torch
 
-from pisigma.deployment.export.programs.text import DIGITS, millimetres_and_euler, number
+from pisigma.deployment.export.programs.text import DIGITS, format_number, millimetres_and_euler
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.scan import (
     COMPUTED,
@@ -179,7 +179,7 @@ def _written(text: str, T: Frame) -> str:
     """Return the text of a position with the values of a pose."""
     x, y, z, r, p, w = millimetres_and_euler(T).tolist()
     values = iter([x, y, z, w, p, r])
-    return _VALUE.sub(lambda match: match[1] + number(next(values), DIGITS), text)
+    return _VALUE.sub(lambda match: match[1] + format_number(next(values), DIGITS), text)
 
 
 def _numbered(text: str) -> str:

@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from pisigma.deployment.export.programs.text import labelled, millimetres_and_euler
+from pisigma.deployment.export.programs.text import format_labelled, millimetres_and_euler
 from pisigma.deployment.export.rewriting.control_flow import ActiveFrames, Step
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.known_routines import KRL
@@ -137,7 +137,7 @@ class _Reader:
                 self.scan.mark_unknown_start()
             if match["move"]:
                 self._move(match)
-            self.frames.advance(place, unknown or self._value(match, step))
+            self.frames.advance_past(place, unknown or self._value(match, step))
         return self.scan.program(self.names)
 
     def _steps(self, match: re.Match[str]) -> list[Step]:
@@ -256,4 +256,4 @@ def _pose(literal: re.Match[str]) -> Pose:
 
 
 def _six(T: Frame) -> str:
-    return labelled(millimetres_and_euler(T).tolist(), "XYZABC")
+    return format_labelled(millimetres_and_euler(T).tolist(), "XYZABC")

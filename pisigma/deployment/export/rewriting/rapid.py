@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import torch
 
-from pisigma.deployment.export.programs.text import millimetres, numbers, quaternion
+from pisigma.deployment.export.programs.text import format_numbers, position_in_mm, quaternion
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.known_routines import RAPID
 from pisigma.deployment.export.rewriting.scan import (
@@ -265,4 +265,4 @@ def _not_normalised(text: str) -> str:
 
 
 def _written(T: Frame) -> str:
-    return f"[{numbers(millimetres(T))}], [{numbers(quaternion(T), 9)}]"
+    return f"[{format_numbers(position_in_mm(T))}], [{format_numbers(quaternion(T), 9)}]"

@@ -137,10 +137,10 @@ class NamedPoses:
         """Return the pose of a name as the target of a move, or the reason why it is unknown."""
         return self.get(name) or self._reasons.get(self._fold(name), COMPUTED)
 
-    def get(self, name: str, target: bool = True) -> Pose | None:
+    def get(self, name: str, is_target: bool = True) -> Pose | None:
         """Return the pose of a name, as the target of a move or as a frame."""
         pose = self._poses.get(self._fold(name))
-        self._uses[self._fold(name)] += target and pose is not None
+        self._uses[self._fold(name)] += is_target and pose is not None
         return pose
 
     def poses_used_elsewhere(self) -> list[Pose]:
@@ -252,9 +252,9 @@ def _among(kept: Mapping[tuple[int, int], Target], target: Target | None) -> Tar
     return None if target is None else kept.get(target.pose.span)
 
 
-def mask_comments(text: str, hidden: re.Pattern[str]) -> str:
+def mask_comments(text: str, comment_pattern: re.Pattern[str]) -> str:
     """Replace comments and strings by spaces, so that all positions are preserved."""
-    return hidden.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
+    return comment_pattern.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
 
 
 def argument_spans(text: str, start: int) -> Iterator[tuple[int, int]]:

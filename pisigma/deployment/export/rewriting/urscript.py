@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from pisigma.deployment.export.programs.text import metres_and_rotation_vector, number, numbers
+from pisigma.deployment.export.programs.text import format_number, format_numbers, metres_and_rotation_vector
 from pisigma.deployment.export.rewriting.control_flow import ActiveFrames, Step
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.known_routines import URSCRIPT
@@ -85,7 +85,7 @@ class _Reader:
                 self._move(match)
             elif literal := _LITERAL.match(self.text, match.end()):
                 tool = _pose(self.text, literal.span()).T
-            self.frames.advance(place, tool)
+            self.frames.advance_past(place, tool)
         return self.scan.program(self.names)
 
     def _step(self, match: re.Match[str]) -> Step:
@@ -161,7 +161,7 @@ class _Reader:
         start, count = self.scan.line_start(call.start()), len(operands)
         ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
-        radius = f"r={number(min(_BLEND, nearest / 4), 6)}"
+        radius = f"r={format_number(min(_BLEND, nearest / 4), 6)}"
         named = [index for index, argument in enumerate(rest) if re.match(r"r\s*=", argument)]
         rest = [radius if index in named else argument for index, argument in enumerate(rest)]
         rest += [] if named else [radius]
@@ -200,4 +200,4 @@ def _pose(text: str, span: _Span) -> Pose:
 
 
 def _written(T: Frame) -> str:
-    return f"p[{numbers(metres_and_rotation_vector(T), 9)}]"
+    return f"p[{format_numbers(metres_and_rotation_vector(T), 9)}]"

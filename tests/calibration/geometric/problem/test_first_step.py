@@ -20,5 +20,5 @@ def test_rejected_rows_have_no_part_in_the_first_descent() -> None:
     wrong = setup.problem.without_prior().with_active(range(30))
     right = wrong.select(torch.tensor([row for row in range(40) if row not in (7, 23)]))
     first = wrong.linearise_at_start(setup.start)
-    wanted = right.linearise(setup.start, None).descent / first.detail.noise[0] ** 2
+    wanted = right.linearise(setup.start, None).descent / first.problem_data.noise[0] ** 2
     assert_close(first.descent, wanted, rtol=1e-9, atol=1e-9 * float(wanted.norm()))

@@ -54,14 +54,14 @@ class Swinging(AbstractLeastSquares[torch.Tensor]):
     def linearise(
         self, point: torch.Tensor, with_noise_of: Linearisation[torch.Tensor] | None
     ) -> Linearisation[torch.Tensor]:
-        believed = 1.0 if with_noise_of is None else float(with_noise_of.detail)
+        believed = 1.0 if with_noise_of is None else float(with_noise_of.problem_data)
         r = torch.stack([point[0] - believed, torch.ones(()).double()])
         return Linearisation(point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed)
 
     def with_updated_noise(
         self, linearisation: Linearisation[torch.Tensor]
     ) -> tuple[Linearisation[torch.Tensor], bool]:
-        other = replace(linearisation, detail=-float(linearisation.detail))
+        other = replace(linearisation, problem_data=-float(linearisation.problem_data))
         return self.linearise(linearisation.point, other), False
 
     def apply_step(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ from testing.models import joints_around
 from testing.refusals import refused
 
 from pisigma.deployment.export.controllers import counts, staubli, universal_robots, ur_ros
-from pisigma.deployment.export.controllers.controller_file import FileContent, untested_on_controller
+from pisigma.deployment.export.controllers.controller_file import FileContent, untested_sentence
 from pisigma.deployment.export.controllers.reading import read_controller_file
 from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
@@ -146,7 +146,7 @@ def test_the_loss_of_accuracy_is_stated(name, model, tmp_path):
     exported = export_model(name, ExportRequest(model, out, **options))
     calibrated, nominal = load_model(model), Robot.load("ur10")
     lost = exported.facts["off_the_whole_model"]
-    not_tried = untested_on_controller("SOURCE").partition("SOURCE")[2]
+    not_tried = untested_sentence("SOURCE").partition("SOURCE")[2]
     assert any(sentence.endswith(not_tried) for sentence in exported.remarks)
     assert f" {lost['mean_mm']:.4g} mm" in " ".join(out.read_text().split())
     held = read_controller_file(out, nominal, 50.0).robot

@@ -171,9 +171,9 @@ def test_a_frame_that_a_fanuc_program_sets_is_not_as_stated(line, understood):
 def test_values_outside_routines_apply_after_their_statement():
     frames = ActiveFrames([Step("set", "tool"), Step("loop"), Step("end"), Step("end")], {"tool": "unknown"})
     assert frames["tool"] == "unknown"
-    frames.advance(0, IDENTITY)
+    frames.advance_past(0, IDENTITY)
     for number in (1, 2, 3):
-        frames.advance(number)
+        frames.advance_past(number)
         assert isinstance(frames["tool"], torch.Tensor)
 
 
