@@ -95,7 +95,7 @@ def _print_status(status: "CellStatus") -> None:
 
 def _controller_lines(status: "CellStatus") -> list[str]:
     """Return a line for every export that is active on the controller."""
-    active = status.facts.controller.active().values()
+    active = status.facts.controller.active_exports().values()
     return [f"{one.export.contains.replace('_', ' ')} on the controller: {one}." for one in active]
 
 
@@ -139,13 +139,13 @@ def refuse_with_cell(**given: object) -> None:
             )
 
 
-def output_in_cell(cell: "Cell | None", part: str, suffix: str) -> Path:
+def output_in_cell(cell: "Cell | None", subfolder: str, suffix: str) -> Path:
     """Return a path for an output in a folder of a cell; refuse a missing `--out` without a cell."""
     from pisigma.workflow.cell.new_files import output_path
 
     if cell is None:
         raise typer.BadParameter("expected a path", param_hint="'--out'")
-    return output_path(cell.folder, part, suffix)
+    return output_path(cell.folder, subfolder, suffix)
 
 
 def next_step_lines(status: "CellStatus") -> list[str]:

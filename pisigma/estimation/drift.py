@@ -30,7 +30,7 @@ class DriftGroup:
     """Unknowns that drift together, independently of each other, with the standard deviation `size · scale`.
 
     Attributes:
-        what: name of the group, such as "joint 3", "base" or "correction".
+        name: name of the group, such as "joint 3", "base" or "correction".
         index: indices of the unknowns of the group.
         scale: standard deviation of every unknown at size 1 [m or rad].
         size: size of the drift; 0 if the group has not drifted.
@@ -39,7 +39,7 @@ class DriftGroup:
         is_one_motion: whether the group is one motion rather than a set of many independent changes.
     """
 
-    what: str
+    name: str
     index: Int64[Tensor, " members"]
     scale: Float64[Tensor, " members"]
     size: float = 0.0
@@ -179,18 +179,18 @@ class DriftSearch:
         return self.values.sigma(self._noise)
 
     def estimate_shift(
-        self, number: int, with_prior: bool = True
+        self, group_index: int, with_prior: bool = True
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
         """Estimate how far the unknowns of a group have moved, with the sizes of all other groups unchanged.
 
         Args:
-            number: index of the group.
+            group_index: index of the group.
             with_prior: whether to use the prior of the group; if not, its unknowns are unconstrained.
 
         Returns:
             The shifts [m or rad] and their covariance.
         """
-        group, (_, a, W) = self._groups[number], self._whitened(number, reduced=False)
+        group, (_, a, W) = self._groups[group_index], self._whitened(group_index, reduced=False)
         normal = W.t() @ W
         if with_prior:
             normal.diagonal().add_(group.size**-2)

@@ -24,33 +24,37 @@ class AbstractLoss(ABC):
     """Cost of a row as a function of its distance in standard deviations; `components` is the number of values."""
 
     @abstractmethod
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return the cost of every row, the squared distance for small distances."""
+    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Return the cost of every row, the squared length for small distances."""
 
     @abstractmethod
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return the least-squares weight of every row: half the derivative of the cost divided by the distance."""
+    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Return the least-squares weight of every row: half the derivative of the cost divided by the length."""
 
     @abstractmethod
     def scale(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
+        self, residual_length: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
     ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value without an initial scale.
 
         Args:
-            distance: distances of the measured rows, in the sensor's unit.
+            residual_length: lengths of the residuals of the measured rows, in the sensor's unit.
             components: number of values per row.
             effective_parameters: effective number of values that the estimated parameters absorb.
         """
 
     @abstractmethod
     def sigma(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
+        self,
+        residual_length: Float[Tensor, " rows"],
+        components: int,
+        effective_parameters: Scalar,
+        scale: Scalar,
     ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value from all good rows.
 
         Args:
-            distance: distances of the measured rows, in the sensor's unit.
+            residual_length: lengths of the residuals of the measured rows, in the sensor's unit.
             components: number of values per row.
             effective_parameters: effective number of values that the estimated parameters absorb.
             scale: initial estimate, to distinguish good rows from outliers.
@@ -61,25 +65,31 @@ class AbstractLoss(ABC):
 class SquaredLoss(AbstractLoss):
     """Plain least squares."""
 
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return the squared distance."""
-        return distance.square()
+    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Return the squared length."""
+        return residual_length.square()
 
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return 1 for every row."""
-        return torch.ones_like(distance)
+        return torch.ones_like(residual_length)
 
     def scale(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
+        self, residual_length: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
-        return self.sigma(distance, components, effective_parameters, 1.0)
+        return self.sigma(residual_length, components, effective_parameters, 1.0)
 
     def sigma(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
+        self,
+        residual_length: Float[Tensor, " rows"],
+        components: int,
+        effective_parameters: Scalar,
+        scale: Scalar,
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
-        return (distance.square().sum() / _left(distance, components, effective_parameters)).sqrt()
+        return (
+            residual_length.square().sum() / _left(residual_length, components, effective_parameters)
+        ).sqrt()
 
 
 @dataclass(frozen=True)
@@ -92,40 +102,48 @@ class HampelLoss(AbstractLoss):
     being wrong.
     """
 
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return the cost of every row: a square, line, parabola or constant, depending on the distance."""
+    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Return the cost of every row: a square, line, parabola or constant, depending on the length."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        straight, bent = distance.clamp(a, c).sub_(a), distance.clamp(b, c).sub_(b)
-        cost: Tensor = distance.clamp(max=a).square_().add_(straight, alpha=2 * a)
+        straight, bent = residual_length.clamp(a, c).sub_(a), residual_length.clamp(b, c).sub_(b)
+        cost: Tensor = residual_length.clamp(max=a).square_().add_(straight, alpha=2 * a)
         return cost.addcmul_(bent, bent, value=-a / (c - b))
 
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return the weight of every row: 1, a / distance, a decreasing function or 0, depending on the distance."""
+    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Return the weight of every row: 1, a / length, a decreasing function or 0, depending on the length."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
-        return falling.mul_(a).div_(distance.clamp(min=a))
+        falling: Tensor = torch.rsub(residual_length, c).div_(c - b).clamp_(0, 1)
+        return falling.mul_(a).div_(residual_length.clamp(min=a))
 
     def scale(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
+        self, residual_length: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
     ) -> Float[Tensor, ""]:
-        """Return the median distance divided by that of a standard normal vector, corrected for the parameters."""
-        factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
-        return distance.median() * _left(distance, components, effective_parameters).rsqrt() * factor
+        """Return the median length divided by that of a standard normal vector, corrected for the parameters."""
+        factor = math.sqrt(len(residual_length) * components) / MEDIAN_DISTANCE[components]
+        return (
+            residual_length.median()
+            * _left(residual_length, components, effective_parameters).rsqrt()
+            * factor
+        )
 
     def sigma(
-        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
+        self,
+        residual_length: Float[Tensor, " rows"],
+        components: int,
+        effective_parameters: Scalar,
+        scale: Scalar,
     ) -> Float[Tensor, ""]:
         """Return the weighted root mean square, corrected for the parameters and the weights."""
-        weight = self.weight(distance / scale, components)
+        weight = self.weight(residual_length / scale, components)
         left = (weight.sum() * components - effective_parameters).clamp(min=1.0)
-        return ((weight * distance.square()).sum() / left / HAMPEL_VARIANCE[components]).sqrt()
+        return ((weight * residual_length.square()).sum() / left / HAMPEL_VARIANCE[components]).sqrt()
 
 
-def _left(distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
+def _left(residual_length: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
     """Return the degrees of freedom that the estimated parameters leave, at least one."""
-    values = len(distance) * components
+    values = len(residual_length) * components
     if isinstance(used, float | int):
-        return distance.new_tensor(max(values - used, 1.0))
+        return residual_length.new_tensor(max(values - used, 1.0))
     return torch.rsub(used, values).clamp(min=1.0)

@@ -28,14 +28,14 @@ class ExplainedRows(Generic[What]):
     """The best explanation of measured values.
 
     Attributes:
-        what: the explanation of the values.
+        explanation: the explanation of the values.
         values: the measured values; those of wrong configurations have larger noise.
         log_evidence: log evidence of the values, including the prior odds of the explanation.
         covariance: covariance of the values.
         sigma: standard deviation of the noise of every value.
     """
 
-    what: What
+    explanation: What
     values: LinearValues
     log_evidence: float
     covariance: Float64[Tensor, "values values"]

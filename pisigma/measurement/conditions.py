@@ -64,7 +64,7 @@ class JointState:
         return (self[start : start + size] for start in range(0, len(self.q), size))
 
 
-def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
+def varying_conditions(measurements: Measurements) -> tuple[str, ...]:
     """Return the names of the conditions that every row states and that vary."""
     stated = []
     for name, values in zip(CONDITIONS, conditions_of(measurements, CONDITIONS).t(), strict=True):
@@ -87,7 +87,7 @@ def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
     The payload is included if every row states one and the values vary. The load is the difference of the torques from
     those of the first row at the same values, in steps of `_TORQUE_STEP`; smaller differences are noise.
     """
-    loaded = tuple(name for name in stated_conditions(measurements) if name == "payload_kg")
+    loaded = tuple(name for name in varying_conditions(measurements) if name == "payload_kg")
     columns = [measurements.q, conditions_of(measurements, loaded)]
     if measurements.approach is not None:
         columns.append(measurements.approach.nan_to_num(0.0))

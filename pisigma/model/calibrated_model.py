@@ -252,7 +252,7 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 
 
 def known_names(
-    frames_of_model: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+    frames_of_model: Frames, names: tuple[str, ...], name_kind: str, measurements: Measurements
 ) -> tuple[str, ...]:
     """Return the name that the model uses for the frame or target of every row.
 
@@ -262,7 +262,7 @@ def known_names(
     Args:
         frames_of_model: frames or targets of the model.
         names: names of the rows' frames or targets.
-        what: "frame" or "target".
+        name_kind: "frame" or "target".
         measurements: the rows, for messages.
 
     Raises:
@@ -272,24 +272,26 @@ def known_names(
         if len(set(names)) > 1:
             other = next(row for row, name in enumerate(names) if name != names[0])
             raise MeasurementError(
-                f"{what} '{names[other]}' differs from '{names[0]}' ({measurements.place_of(0)}), but the model has "
-                f"only one {what}",
-                expected=f"{what} '{names[0]}'",
+                f"{name_kind} '{names[other]}' differs from '{names[0]}' ({measurements.place_of(0)}), but the model "
+                f"has only one {name_kind}",
+                expected=f"{name_kind} '{names[0]}'",
                 value=names[other],
-                at=measurements.place_of(other, what),
-                remedy=f"give a file for each {what}",
+                at=measurements.place_of(other, name_kind),
+                remedy=f"give a file for each {name_kind}",
             )
         return ("",) * len(names)
     if len(frames_of_model) == 1 and not any(names):
         return tuple(frames_of_model) * len(names)
     for row, name in enumerate(names):
         if name not in frames_of_model:
-            crossed = (measurements.target if what == "frame" else measurements.frame)[row] in frames_of_model
+            crossed = (measurements.target if name_kind == "frame" else measurements.frame)[
+                row
+            ] in frames_of_model
             hint = "check --fixed-camera if it is a camera; " if name and crossed else ""
             raise MeasurementError(
-                f"the model was not calibrated for {what} '{name}'",
+                f"the model was not calibrated for {name_kind} '{name}'",
                 value=name,
-                at=measurements.place_of(row, what),
+                at=measurements.place_of(row, name_kind),
                 remedy=f"{hint}{nearest_choice(name, frames_of_model)}",
             )
     return names
@@ -313,10 +315,10 @@ def _seen(
 
 
 def _of_rows(
-    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+    known: Frames, names: tuple[str, ...], name_kind: str, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"] | None:
     """Return the base or tool of every row; None if the model has only one, which the robot already contains."""
-    names = known_names(known, names, what, measurements)
+    names = known_names(known, names, name_kind, measurements)
     if len(known) < 2:
         return None
     order = list(known)

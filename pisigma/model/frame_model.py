@@ -51,14 +51,14 @@ class FittedFrames:
         return tuple(self.arm_root.square().sum(1).tolist())
 
 
-def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> FittedFrames:
+def frames_of_robot(robot: Robot, rows: Measurements, frame_choice: FrameChoice) -> FittedFrames:
     """Fit frames with the arm of a nominal robot; for the errors see `fit_frames`."""
-    fit = fit_frames(robot, rows, only)
+    fit = fit_frames(robot, rows, frame_choice)
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
     return FittedFrames(fit, replace(model, kind=_KIND), _exact_arm(fit), misfit_causes(fit))
 
 
-def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoice) -> FittedFrames:
+def frames_of_model(model: CalibratedModel, rows: Measurements, frame_choice: FrameChoice) -> FittedFrames:
     """Fit frames with the arm of a model, including its joint correction.
 
     The model gets the fitted bases of the frames of the rows, or the fitted tools of their targets, instead of its own;
@@ -67,7 +67,7 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     Args:
         model: model with identified or nominal geometry.
         rows: rows; the names of frames or targets that are not fitted are those of the model.
-        only: what to fit.
+        frame_choice: what to fit.
 
     Raises:
         ModelError: a network corrects the nominal joint values of the model's poses, which depend on base and tool.
@@ -84,12 +84,12 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
         )
     arm = model.hybrid
     bases, tools = (model.bases, model.tools) if arm is None else (model.hybrid_bases, model.hybrid_tools)
-    if only == "tool":
+    if frame_choice == "tool":
         rows = replace(rows, frame=known_names(bases, rows.frame, "frame", rows))
-    if only == "base":
+    if frame_choice == "base":
         rows = replace(rows, target=known_names(tools, rows.target, "target", rows))
     moved = rows if arm is None else replace(rows, q=corrected_joints(arm, rows))
-    fit = fit_frames(model.identified, moved, only, bases, tools)
+    fit = fit_frames(model.identified, moved, frame_choice, bases, tools)
     known = None if model.uncertainty is None else ArmUncertainty(model.uncertainty, rows)
     arm_root = _exact_arm(fit) if known is None else _arm_root(known, fit)
     uncertainty = None if known is None else _uncertainty(known, fit, arm_root)
@@ -123,9 +123,9 @@ def _with_frames(model: CalibratedModel, fit: FrameFit, rows: Measurements) -> C
     """Replace the frames of a model."""
     solved, arm = fit.solved.geometry, model.hybrid
     fitted: dict[str, dict[str, np.ndarray]] = {}
-    if fit.only != "tool":
+    if fit.frame_choice != "tool":
         fitted["bases"] = dict(solved.bases)
-    if fit.only != "base":
+    if fit.frame_choice != "base":
         fitted["tools"] = dict(solved.tools)
     own, of_hybrid = fitted, dict[str, Any]()
     if arm is not None:
@@ -181,7 +181,7 @@ def _uncertainty(
 ) -> PositionUncertainty:
     """Return the uncertainty of a model with fitted frames; points of sensors in a fitted base are dropped."""
     known, solved = model.uncertainty, fit.solved.geometry
-    old, fits_base, fits_tool = known.space, fit.only != "tool", fit.only != "base"
+    old, fits_base, fits_tool = known.space, fit.frame_choice != "tool", fit.frame_choice != "base"
     bases = solved.bases if fits_base else known.geometry.bases
     tools = solved.tools if fits_tool else known.geometry.tools
     unknowns = {} if fits_base else known.geometry.unknowns

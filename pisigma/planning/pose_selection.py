@@ -168,12 +168,12 @@ class PoseSelection:
         """Compute the gain of every candidate: information [nats] for D, variance [m²] for I; -inf if selected."""
         return self._gains(self._S, self._P)
 
-    def add_candidate(self, number: int) -> None:
+    def add_candidate(self, candidate_index: int) -> None:
         """Add a candidate to the selection."""
-        change = self._change(number, 1.0)
+        change = self._change(candidate_index, 1.0)
         assert change is not None  # adding a candidate loses no numerical accuracy
         self._take(change)
-        self.chosen.append(number)
+        self.chosen.append(candidate_index)
 
     def add_until(self, count: int) -> None:
         """Add the best candidates until `count` are selected."""

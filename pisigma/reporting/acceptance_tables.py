@@ -17,7 +17,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     """Return sentences on the predicted budget, the measured errors, the limit, and who accepted the model."""
     budget, measured, lines = acceptance.budget, acceptance.measured, list[str]()
     if budget.components:
-        start = f"With the stated components alone, {_SHARE}" if budget.missing else _SHARE
+        start = f"With the stated components alone, {_SHARE}" if budget.missing_components else _SHARE
         U, k, radius = budget.expanded_uncertainty * 1e3, budget.coverage_factor, budget.coverage_radius * 1e3
         lines.append(
             f"{start} of the positions are expected within {radius:.3f} mm of the commanded ones; the expanded "
@@ -38,9 +38,9 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
         )
     if measured is not None and measured.distrust_reason:
         lines.append(measured.distrust_reason)
-    if acceptance.contradicted:
+    if acceptance.is_contradicted:
         lines.append(contradiction_sentence(acceptance))
-    of_model = [one for one in acceptance.accepted if one.model == acceptance.model]
+    of_model = [one for one in acceptance.acceptance_events if one.model == acceptance.model]
     lines.append(
         of_model[-1].sentence if of_model else f"Nobody has accepted model '{acceptance.model}' yet."
     )
@@ -98,7 +98,8 @@ def budget_table(acceptance: Acceptance) -> Table:
         for one in budget.components
     ]
     rows += [
-        (line.partition(":")[0], "", _NOT_STATED, "", line.partition(": ")[2]) for line in budget.missing
+        (line.partition(":")[0], "", _NOT_STATED, "", line.partition(": ")[2])
+        for line in budget.missing_components
     ]
     if budget.components:
         freedom, k = budget.effective_degrees_of_freedom, budget.coverage_factor

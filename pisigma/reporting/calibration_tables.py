@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
-from pisigma.reporting.rendering import sentences
+from pisigma.reporting.rendering import render_sentences
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import number_text
 from pisigma.validation.held_out.calibration_summary import (
@@ -30,7 +30,7 @@ _SIGNIFICANT = 2.0
 _UNCERTAIN = "not distinguishable from 0"
 _FIGURES = ("nominal", "estimated", "change", "standard_error")
 
-_say = functools.partial(sentences, "calibration.txt.j2")
+_say = functools.partial(render_sentences, "calibration.txt.j2")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pisigma.reporting import calibration_tables as tables
 from pisigma.reporting.calibration_tables import parameter_table, undetermined_lines
-from pisigma.reporting.result_text import Block, ResultText, Table, sentences, table_block
+from pisigma.reporting.result_text import Block, ResultText, Table, sentence_block, table_block
 from pisigma.reporting.tables import distance_table
-from pisigma.reporting.verdict import Verdict, count_text, rms_text, rounded
+from pisigma.reporting.verdict import Verdict, count_text, rms_text, rounded_text
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 
@@ -31,7 +31,7 @@ def error_table(figures: ValidationFigures) -> Table:
         statistic, unit = key.rsplit("_", 1)
         if statistic in _SHOWN:
             quantity = "position" if unit == "mm" else "orientation"
-            cells = (rounded(errors[key], figures.rows) for errors in named)
+            cells = (rounded_text(errors[key], figures.rows) for errors in named)
             rows.append((f"{quantity}, {_SHOWN[statistic]} [{unit}]", *cells))
     return Table(("error", *models), tuple(rows))
 
@@ -60,15 +60,17 @@ def error_quantity(summary: CalibrationSummary) -> str:
     return "the measured point in the sensor's frame" if "position" in sensors else "the measured values"
 
 
-def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnings: int) -> Verdict:
+def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warning_count: int) -> Verdict:
     """Return the verdict on a calibration.
 
     Args:
         summary: figures of the calibration.
         folder: folder of the model; None if no folder was written.
-        warnings: number of warnings.
+        warning_count: number of warnings.
     """
-    return Verdict(_accuracy(summary), _trust(summary, warnings), _next_step(summary, folder, warnings))
+    return Verdict(
+        _accuracy(summary), _trust(summary, warning_count), _next_step(summary, folder, warning_count)
+    )
 
 
 def _accuracy(summary: CalibrationSummary) -> str:
@@ -80,7 +82,7 @@ def _accuracy(summary: CalibrationSummary) -> str:
     scatter = ", with the scatter of the images" if images else ""
     if figures is None and summary.predicted_rms_mm is not None and not implausible:
         return (
-            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses{scatter}, as predicted from the "
+            f"{rounded_text(summary.predicted_rms_mm, 0)} mm RMS at other poses{scatter}, as predicted from the "
             "uncertainty of the calibration; no row was held out."
         )
     figures = figures or summary.calibrated
@@ -178,7 +180,7 @@ def calibration_text(
     return ResultText(
         calibration_verdict(summary, folder, len(warnings)),
         tuple(warnings),
-        (*first_blocks, *_accuracy_blocks(summary), sentences("scale of the sensor", remarks)),
+        (*first_blocks, *_accuracy_blocks(summary), sentence_block("scale of the sensor", remarks)),
         (*_learned(summary), *_fit(summary), *_parameters(summary)),
         () if folder is None else (written,),
     )
@@ -193,18 +195,18 @@ def _accuracy_blocks(summary: CalibrationSummary) -> Iterator[Block]:
         if figures.socket_distance is not None:
             what = "stated distances between sockets, under calibrations without them"
             yield table_block(what, *distance_table(figures.socket_distance), "distances between sockets")
-        yield sentences("remarks on the held-out rows", tables.held_out_lines(figures))
+        yield sentence_block("remarks on the held-out rows", tables.held_out_lines(figures))
 
 
 def _learned(summary: CalibrationSummary) -> Iterator[Block]:
     """Return the joint correction, and other corrections that were tried, as text."""
     if summary.hybrid is not None:
-        yield sentences("joint correction", tables.learned_lines(summary.hybrid))
+        yield sentence_block("joint correction", tables.learned_lines(summary.hybrid))
         yield table_block("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
     if summary.validation_errors is not None and (
         coverage := tables.coverage_line(summary.validation_errors)
     ):
-        yield sentences("predicted intervals", [coverage])
+        yield sentence_block("predicted intervals", [coverage])
     if summary.learning_curve is not None:
         what = "errors of held-out rows by number of training rows"
         yield table_block(what, *tables.curve_table(summary.learning_curve), "learning curve")
@@ -218,7 +220,7 @@ def _fit(summary: CalibrationSummary) -> Iterator[Block]:
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     line = f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."
-    yield sentences("outliers", [line])
+    yield sentence_block("outliers", [line])
 
 
 def _parameters(summary: CalibrationSummary) -> Iterator[Block]:
@@ -227,4 +229,4 @@ def _parameters(summary: CalibrationSummary) -> Iterator[Block]:
         "parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters"
     )
     lines = ["What these data cannot determine:", *(f"- {one}" for one in undetermined_lines(summary))]
-    yield sentences("undetermined parameters", lines, "  ")
+    yield sentence_block("undetermined parameters", lines, "  ")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pisigma.reporting.result_text import Block, Table, table_block
 from pisigma.reporting.tables import distance_table
-from pisigma.reporting.verdict import rounded
+from pisigma.reporting.verdict import rounded_text
 from pisigma.validation.held_out.model_comparison import (
     Difference,
     Interval,
@@ -48,7 +48,7 @@ def model_rms_text(figures: ModelFigures, rows: int) -> str:
     """Return the RMS errors of a model as text."""
     errors = (figures.position, figures.orientation)
     return " and ".join(
-        f"{rounded(one.statistics['rms'], rows)} {one.unit}" for one in errors if one is not None
+        f"{rounded_text(one.statistics['rms'], rows)} {one.unit}" for one in errors if one is not None
     )
 
 
@@ -100,7 +100,7 @@ def _error_lines(comparison: ModelComparison, full: bool) -> _Lines:
         lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", shown, errors)
         word = "along" if quantity == "position" else "about"
         for axis in first.axes if full else ():
-            values = [rounded(one.axes[axis]["rms"], comparison.rows) for one in errors]
+            values = [rounded_text(one.axes[axis]["rms"], comparison.rows) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
     if any(model.rows_outside_domain for model in models):
         for quantity, first in models[0].quantities.items():
@@ -125,7 +125,7 @@ def _statistic_lines(
     lines: _Lines = []
     for key, statistic in shown.items():
         lines.append(
-            (label.format(statistic), [rounded(one.statistics[key], comparison.rows) for one in errors])
+            (label.format(statistic), [rounded_text(one.statistics[key], comparison.rows) for one in errors])
         )
         if errors[0].intervals.get(key) is not None:
             confidence = f"  {100 * comparison.bootstrap.confidence:.0f} % confidence"
@@ -156,13 +156,13 @@ def _difference(errors: QuantityErrors) -> Difference:
 
 
 def _domain(statistics: Mapping[str, float], rows: int | None) -> str:
-    return f"{rounded(statistics['rms'], rows or 0)} ({rows} rows)" if statistics else _NONE
+    return f"{rounded_text(statistics['rms'], rows or 0)} ({rows} rows)" if statistics else _NONE
 
 
 def _interval(interval: Interval | None) -> str:
     if interval is None:
         return _NONE
-    return f"[{', '.join(rounded(end, 0) for end in interval)}]"
+    return f"[{', '.join(rounded_text(end, 0) for end in interval)}]"
 
 
 def _p(value: float) -> str:

@@ -17,7 +17,7 @@ from pisigma.reporting.frame_text import (
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import number_text
-from pisigma.reporting.verdict import rounded
+from pisigma.reporting.verdict import rounded_text
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
 from pisigma.validation.held_out.frame_summary import FrameSummary
 
@@ -68,7 +68,7 @@ def candidate_table(summary: RecalibrationSummary) -> Table:
     rows = (
         (
             names[name],
-            "too few rows" if errors.rms_mm is None else rounded(errors.rms_mm, summary.left_out),
+            "too few rows" if errors.rms_mm is None else rounded_text(errors.rms_mm, summary.left_out),
             "yes" if name == summary.kept else "no",
         )
         for name, errors in summary.cross_validation.items()

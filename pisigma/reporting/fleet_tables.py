@@ -6,7 +6,7 @@ from pisigma.lifetime.cell.status import CellStatus
 from pisigma.lifetime.cell.step import ATTENTION
 from pisigma.lifetime.fleet.status import UNREADABLE, FleetStatus
 from pisigma.reporting.result_text import Table
-from pisigma.reporting.verdict import Verdict, count_text, rounded
+from pisigma.reporting.verdict import Verdict, count_text, rounded_text
 
 ERRORS_NOTE = (
     "RMS is the position error under the model in use that the last command found: calibrate (held-out rows or, "
@@ -54,7 +54,7 @@ def fleet_verdict(status: FleetStatus) -> Verdict:
     return Verdict(
         "not known yet for any cell."
         if worst is None
-        else f"largest error {rounded(worst[1].rms_mm or 0.0, 0)} mm RMS, of {worst[0].name}.",
+        else f"largest error {rounded_text(worst[1].rms_mm or 0.0, 0)} mm RMS, of {worst[0].name}.",
         f"{found} of {count_text(count, 'cell')}." if found else "yes: no cell needs attention.",
         f"`pisigma fleet run {status.folder}` ({count_text(due, 'cell')} can be processed)."
         if due

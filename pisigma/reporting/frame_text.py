@@ -7,8 +7,8 @@ from pathlib import Path
 from pisigma.calibration.frames.misfit_causes import CAUSES
 from pisigma.estimation.alternatives import CLEAR
 from pisigma.reporting.calibration_text import calibration_verdict
-from pisigma.reporting.result_text import ResultText, Table, sentences, table_block
-from pisigma.reporting.verdict import Verdict, count_text, rounded
+from pisigma.reporting.result_text import ResultText, Table, sentence_block, table_block
+from pisigma.reporting.verdict import Verdict, count_text, rounded_text
 from pisigma.validation.held_out.arms_summary import ArmBaseFigures, ArmsSummary
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.frame_summary import CoordinateFigures, FrameSummary
@@ -92,7 +92,7 @@ def coordinate_title(summary: FrameSummary) -> str:
 def fit_lines(summary: FrameSummary) -> list[str]:
     """Return sentences on the residuals, and on directions that the rows hardly determine."""
     sizes = [
-        f"{rounded(value, summary.rows)} {unit}"
+        f"{rounded_text(value, summary.rows)} {unit}"
         for value, unit in ((summary.rms_mm, "mm"), (summary.rms_deg, "deg"))
         if value is not None
     ]
@@ -116,7 +116,7 @@ def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> Re
         (
             table_block(coordinate_title(summary), *coordinate_table(summary)),
             *([table_block(CAUSE_TITLE, *cause_table(summary), "causes")] if summary.causes else []),
-            sentences("the fit", fit_lines(summary)),
+            sentence_block("the fit", fit_lines(summary)),
         ),
         (),
         written,
@@ -128,7 +128,7 @@ def _verdict(summary: FrameSummary, folder: Path | None, warnings: int) -> Verdi
         unit: max((one.standard_error or 0.0 for one in summary.coordinates if one.unit == unit), default=0.0)
         for unit in ("mm", "deg")
     }
-    accuracy = " and ".join(f"{rounded(value, 0)} {unit}" for unit, value in worst.items() if value > 0)
+    accuracy = " and ".join(f"{rounded_text(value, 0)} {unit}" for unit, value in worst.items() if value > 0)
     lost = [one.name for one in summary.coordinates if one.standard_error is None]
     arm = "of the model" if summary.parent else "as drawn"
     cautions = [count_text(warnings, "warning")] if warnings else []
@@ -167,7 +167,7 @@ def rotation_lines(summary: ArmsSummary) -> list[str]:
     """Return a sentence on the standard errors of the rotation of every base."""
     return [
         f"The rotation of the base of '{one.arm}' about x, y, z of '{one.in_base_of}' has standard errors of "
-        f"{', '.join(rounded(error, 0) for error in one.standard_errors[3:])} deg."
+        f"{', '.join(rounded_text(error, 0) for error in one.standard_errors[3:])} deg."
         for one in summary.bases
     ]
 
@@ -176,7 +176,7 @@ def tip_lines(summary: ArmsSummary) -> list[str]:
     """Return a sentence on every touching tip that was found together with the bases."""
     return [
         f"The tip '{one.name}' of '{one.arm}' is at {one.x_mm:.3f}, {one.y_mm:.3f}, {one.z_mm:.3f} mm on the last row "
-        f"(standard errors {', '.join(rounded(error, 0) for error in one.standard_errors)} mm)."
+        f"(standard errors {', '.join(rounded_text(error, 0) for error in one.standard_errors)} mm)."
         for one in summary.tips
     ]
 
@@ -200,7 +200,8 @@ def arms_text(
     warnings = (*(one.sentence for one in summary.diagnostics), *warnings)
     rows = [row for one in summary.bases for row in base_rows(one)]
     shared = [
-        (one.kind, one.name, " and ".join(one.arms), rounded(one.distance_mm, 0)) for one in summary.shared
+        (one.kind, one.name, " and ".join(one.arms), rounded_text(one.distance_mm, 0))
+        for one in summary.shared
     ]
     arms = [
         f"{name}: {calibration_verdict(one, None, len(one.warnings)).short.removeprefix('Verdict: ')}"
@@ -217,11 +218,11 @@ def arms_text(
         warnings,
         (
             table_block("bases of the arms relative to each other", BASE_COLUMNS, rows, "bases"),
-            sentences("rotations", rotation_lines(summary)),
-            *((sentences("tips", tip_lines(summary)),) if summary.tips else ()),
+            sentence_block("rotations", rotation_lines(summary)),
+            *((sentence_block("tips", tip_lines(summary)),) if summary.tips else ()),
             table_block("shared by the arms", ("kind", "name", "arms", "apart [mm]"), shared),
-            sentences("agreement", [agreement]),
-            sentences("arms", arms),
+            sentence_block("agreement", [agreement]),
+            sentence_block("arms", arms),
         ),
         (),
         () if folder is None else (f"Models and frames.yaml written to {folder} in {seconds:.1f} s.",),
@@ -244,7 +245,7 @@ def _arms_verdict(
     else:
         trust = f"with caution ({count_text(warnings, 'warning')})." if warnings else "yes."
     return Verdict(
-        f"tool to tool {rounded(between, 0)} mm RMS, as predicted from the uncertainty of the calibrations.",
+        f"tool to tool {rounded_text(between, 0)} mm RMS, as predicted from the uncertainty of the calibrations.",
         trust,
         "correct the problem that the first warning names."
         if summary.diagnostics or doubtful or folder is None

@@ -31,7 +31,7 @@ def _chart_row(chart: Chart) -> tuple[str, ...]:
     last = float(chart.values[-1])
     shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_of_limit, chart.cusum_of_limit))
     value = f"{last:z.4f}" if last == last else "unobservable"
-    return (chart.what, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
+    return (chart.quantity, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
 
 
 _NO_VALUE = "-"

@@ -34,7 +34,7 @@ def render(template: str, **content: object) -> str:
     return _environment().get_template(template).render(content)
 
 
-def sentences(template: str, macro: str, *values: object) -> tuple[str, ...]:
+def render_sentences(template: str, macro: str, *values: object) -> tuple[str, ...]:
     """Fill in a macro of a template and return its paragraphs, which are separated by empty lines."""
     text = getattr(_environment().get_template(template).module, macro)(*values)
     return tuple(paragraph.strip() for paragraph in text.split("\n\n") if paragraph.strip())

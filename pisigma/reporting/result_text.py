@@ -53,7 +53,7 @@ def table_block(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     return Block(name or title, (title,), tuple(columns), tuple(map(tuple, rows)))
 
 
-def sentences(name: str, lines: Iterable[str], indent: str = "") -> Block:
+def sentence_block(name: str, lines: Iterable[str], indent: str = "") -> Block:
     """Return sentences as a block."""
     return Block(name, tuple(lines), indent=indent)
 

@@ -8,7 +8,7 @@ import numpy as np
 from pisigma.files.errors import make_printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState, SessionStep
 from pisigma.reporting.result_text import MAX_ALIKE, ResultText, merge_alike_warnings, numbers_as_ranges
-from pisigma.reporting.verdict import Verdict, count_text, rounded, uncapitalised
+from pisigma.reporting.verdict import Verdict, count_text, rounded_text, uncapitalised
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -54,7 +54,7 @@ def accuracy_text(point: AccuracyPoint) -> str:
 
 
 def _errors(name: str, rms: float, p95: float) -> str:
-    return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"
+    return "" if rms != rms else f"{name} {rounded_text(rms * 1e3)} and {rounded_text(p95 * 1e3)} mm"
 
 
 _SHOWN_ROWS, _SHOWN_ALARMS, _SHOWN_POINTS = 8, 4, 8
@@ -92,8 +92,8 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
         return
     worst = lines[int(np.nanargmax(errors))]
     yield (
-        f"lines {numbers_as_ranges(lines)}: {rounded(float(np.sqrt((known**2).mean())), len(known))} mm RMS from what "
-        f"the other rows predict, at most {rounded(float(known.max()), len(known))} mm (line {worst})"
+        f"lines {numbers_as_ranges(lines)}: {rounded_text(float(np.sqrt((known**2).mean())), len(known))} mm RMS from "
+        f"what the other rows predict, at most {rounded_text(float(known.max()), len(known))} mm (line {worst})"
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
-from pisigma.reporting.result_text import Block, ResultText, sentences, table_block
+from pisigma.reporting.result_text import Block, ResultText, sentence_block, table_block
 from pisigma.reporting.verdict import Verdict
 from pisigma.robot.kinematics.status import Status
 
@@ -33,7 +33,7 @@ def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
         "Solution",
     )
     axes = ", ".join(solution.ignored_axes)
-    remarks = sentences("ignored axes", [f"Ignored axes of the tool: {axes}."] if axes else [])
+    remarks = sentence_block("ignored axes", [f"Ignored axes of the tool: {axes}."] if axes else [])
     tables = _one(solution, solver, names[0]) if len(statuses) == 1 else _several(solution, solver, names)
     return ResultText(verdict, tuple(solver.warnings), (remarks, tables) if reached else ())
 

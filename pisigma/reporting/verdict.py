@@ -43,7 +43,7 @@ class Verdict:
         return ((self.heading, self.accuracy), ("Trust", self.trust), ("Next", self.next_step))
 
 
-def rounded(value: float, rows: int = _MANY_ROWS) -> str:
+def rounded_text(value: float, rows: int = _MANY_ROWS) -> str:
     """Return an error with three digits, or two if few rows were evaluated."""
     digits = 3 if rows >= _MANY_ROWS else 2
     if value == 0 or not math.isfinite(value):
@@ -66,5 +66,5 @@ def count_text(count: int, noun: str) -> str:
 def rms_text(errors: "ErrorFigures", rows: int) -> str:
     """Return the RMS of positions and of orientations, as far as they are known, as text."""
     figures = ((errors.rms_mm, "mm"), (errors.rms_deg, "deg"))
-    known = [f"{rounded(value, rows)} {unit}" for value, unit in figures if value is not None]
+    known = [f"{rounded_text(value, rows)} {unit}" for value, unit in figures if value is not None]
     return " and ".join(known) or "unknown"

@@ -97,7 +97,7 @@ class BranchSection(Section):
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
         """Return the controller values of `near_deg` and `near_mm` [rad or m]."""
         fields = ("near_deg", "near_mm")
-        stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", axes=True)
+        stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", by_axis_name=True)
         values = [axis.from_file_unit(stated.get(index, 0.0)) for index, axis in enumerate(robot.axes)]
         near: Tensor = robot.to_dh(torch.tensor(values, dtype=torch.float64))
         return near

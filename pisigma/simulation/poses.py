@@ -130,7 +130,9 @@ class JointsRandom(Section):
             middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
             bounds: np.ndarray = middle + self.range_fraction * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
-        ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random", axes=True)
+        ranges = stated_joints(
+            robot, self.range_deg, self.range_mm, fields, "joints_random", by_axis_name=True
+        )
         for index, stated in ranges.items():
             is_revolute = robot.axes[index].type == "revolute"
             bounds[index] = np.deg2rad(stated) if is_revolute else np.array(stated) / 1e3

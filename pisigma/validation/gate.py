@@ -61,7 +61,7 @@ class RowVerdict:
 def check_rows(
     rows: Measurements,
     reference: Robot | CalibratedModel,
-    fitted: Collection[FrameKind] = (),
+    fitted_kinds: Collection[FrameKind] = (),
     allowed_moves: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
@@ -75,7 +75,7 @@ def check_rows(
     Args:
         rows: the rows.
         reference: a calibrated model, or the nominal robot.
-        fitted: frames and tools that are known to have moved since the model was made.
+        fitted_kinds: frames and tools that are known to have moved since the model was made.
         allowed_moves: what else may have moved since then without this being a fault of the rows.
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
 
@@ -91,20 +91,20 @@ def check_rows(
         reference = reference.nominal
     if isinstance(reference, Robot):
         return RowVerdict(_until_implausible(_against_robot(rows, reference)))
-    return check_rows_by_model(rows, reference, fitted, allowed_moves, nominal)
+    return check_rows_by_model(rows, reference, fitted_kinds, allowed_moves, nominal)
 
 
 def check_rows_by_model(
     rows: Measurements,
     model: CalibratedModel,
-    fitted: Collection[FrameKind] = (),
+    fitted_kinds: Collection[FrameKind] = (),
     allowed_moves: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
     """Run the checks of `ROW_CHECKS`, or `diagnose_lengths` for rows without positions; see `check_rows`."""
-    judged = RowsUnderModel.from_rows(model, rows, fitted, allowed_moves, nominal)
+    judged = RowsUnderModel.from_rows(model, rows, fitted_kinds, allowed_moves, nominal)
     if judged is None and rows.position is None:
-        diagnostics, faults = diagnose_lengths(model, rows, fitted, allowed_moves)
+        diagnostics, faults = diagnose_lengths(model, rows, fitted_kinds, allowed_moves)
         return RowVerdict(diagnostics, None, faults)
     if judged is None:
         return RowVerdict()
@@ -141,7 +141,7 @@ def check_rows_of_frames(
         if isinstance(reference, Robot):
             yield check_rows(some, reference).diagnostics
         model = fitted.model if isinstance(reference, Robot) else reference
-        yield check_rows_by_model(some, model, kinds[fitted.fit.only]).diagnostics
+        yield check_rows_by_model(some, model, kinds[fitted.fit.frame_choice]).diagnostics
         yield check_residual(checked)
 
     return _until_implausible(findings())

@@ -114,7 +114,7 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
     Raises:
         PisigmaError: the file is written in a way in which a value cannot be changed alone.
     """
-    text = text_of(file.path.parent)
+    text = cell_file_text(file.path.parent)
     fields = itertools.chain.from_iterable(form_of_cell(file).values())
     entered = [(one, form.get(one.key, one.value).strip()) for one in fields]
     changed = [(one, value) for one, value in entered if value != one.value]
@@ -126,7 +126,7 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
     return text
 
 
-def text_of(folder: Path) -> str:
+def cell_file_text(folder: Path) -> str:
     """Return the text of the `cell.yaml` in a folder, even where it is not UTF-8."""
     return (folder / CELL_FILE).read_text(encoding="utf-8", errors="replace")
 

@@ -28,13 +28,13 @@ from pisigma.model.inverse.solution import Solution
 from pisigma.planning.session.growing_images import growing_file
 from pisigma.planning.session.state import SessionState
 from pisigma.reporting.calibration_text import calibration_text
-from pisigma.reporting.result_text import ResultText, sentences, table_block
+from pisigma.reporting.result_text import ResultText, sentence_block, table_block
 from pisigma.reporting.session_text import session_text
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workbench.forms import changed_cell, changed_settings, digest_of, text_of
+from pisigma.workbench.forms import cell_file_text, changed_cell, changed_settings, digest_of
 from pisigma.workbench.job import Outcome, StoppedError
 from pisigma.workbench.tabs import CHARTS, download_of
 from pisigma.workflow.calibrate import Calibration
@@ -91,7 +91,7 @@ def write_cell(folder: Path, form: Form, earlier_texts: dict[str, str]) -> None:
     Raises:
         PlanningError: the file has been changed in the meantime, or the new text is not valid.
     """
-    before = text_of(folder)
+    before = cell_file_text(folder)
     digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
     if digest not in (form.get("seen"), undo) or (undo and undo not in earlier_texts):
         raise PlanningError(
@@ -124,7 +124,7 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     accept = form.get("accept_implausible") == "true"
     found, entry = cell.calibrate(progress, accept, **changed_settings("calibrate", form))
     folder = None if entry is None else cell.model_folder(entry.name)
-    also = [] if entry is None else [sentences("the cell", [f"Model '{entry.name}': {entry.remark}."])]
+    also = [] if entry is None else [sentence_block("the cell", [f"Model '{entry.name}': {entry.remark}."])]
     assert isinstance(found, Calibration)  # there is no prior
     text = calibration_text(found.summary, folder, found.seconds, also)
     return Outcome(
@@ -299,7 +299,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
         side_by_side(exported.leading_text),
     )
     blocks = (
-        sentences("remarks", exported.remarks),
+        sentence_block("remarks", exported.remarks),
         table_block("What was changed", ("line", "before", "after"), changed),
         table_block("Poses that were left unchanged", ("line", "reason"), alone),
     )

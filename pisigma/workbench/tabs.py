@@ -22,12 +22,12 @@ from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workbench.forms import (
+    cell_file_text,
     digest_of,
     form_of,
     form_of_cell,
     form_of_command,
     form_of_new_cell,
-    text_of,
 )
 from pisigma.workbench.job import Jobs
 from pisigma.workbench.model_server import ModelServer
@@ -113,7 +113,7 @@ class Tabs:
             },
         )
 
-    def page(self, folder: Path, cell: Cell | None, is_broken: bool = False) -> str:
+    def render_page(self, folder: Path, cell: Cell | None, is_broken: bool = False) -> str:
         """Return the frame of the page, without the content of a tab; without a cell, there is only one tab.
 
         Args:
@@ -136,14 +136,14 @@ class Tabs:
             outcomes=self._jobs.outcomes,
         )
 
-    def repair(self, folder: Path, fault: str) -> str:
+    def render_repair_form(self, folder: Path, fault: str) -> str:
         """Render the text of a `cell.yaml` that cannot be used, with what is wrong with it."""
-        text = text_of(folder)
+        text = cell_file_text(folder)
         return self._environment.get_template("repair.html.j2").render(
             fault=fault, text=text, seen=digest_of(text), outcomes=self._jobs.outcomes
         )
 
-    def tab(self, name: str, cell: Cell, status: CellStatus, earlier_texts: Mapping[str, str]) -> str:
+    def render_tab(self, name: str, cell: Cell, status: CellStatus, earlier_texts: Mapping[str, str]) -> str:
         """Render the content of a tab.
 
         Args:
@@ -167,7 +167,7 @@ class Tabs:
             context | _more(name, cell, status, earlier_texts)
         )
 
-    def proposal(self, incoming: IncomingRows, numbers: str) -> str:
+    def render_proposal(self, incoming: IncomingRows, numbers: str) -> str:
         """Render the proposed meaning of the columns of uploaded files.
 
         Args:
@@ -183,7 +183,9 @@ class Tabs:
             numbers=numbers,
         )
 
-    def findings(self, incoming: IncomingRows, diagnostics: Sequence[Diagnostic], problem: str = "") -> str:
+    def render_findings(
+        self, incoming: IncomingRows, diagnostics: Sequence[Diagnostic], problem: str = ""
+    ) -> str:
         """Return HTML with the findings of the check of uploaded rows next to the rows, with repairs.
 
         Args:
@@ -235,7 +237,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
         case "cell":
-            text = text_of(cell.folder)
+            text = cell_file_text(cell.folder)
             seen = digest_of(text)
             return {"text": text, "seen": seen, "settings": form_of_cell(cell.file), "undo": seen in texts}
         case "plan":

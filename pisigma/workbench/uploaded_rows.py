@@ -51,7 +51,7 @@ class UploadedRows:
 
         def propose() -> str:
             incoming = self._incoming(Cell.open(self.folder), form)
-            text = self._tabs.proposal(incoming, form.get("files", ""))
+            text = self._tabs.render_proposal(incoming, form.get("files", ""))
             with contextlib.suppress(PisigmaError):  # the check reports what is wrong
                 rows = incoming.unchecked_rows
                 self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
@@ -68,9 +68,9 @@ class UploadedRows:
             try:
                 found = incoming.check(form.get("date", "").strip())
             except PisigmaError as problem:
-                return self._uploads.without_folder(self._tabs.findings(incoming, (), str(problem)))
+                return self._uploads.without_folder(self._tabs.render_findings(incoming, (), str(problem)))
             self._scene.mark_lines(line_numbers_in(" ".join(row for one in found for row in one.rows)))
-            return self._uploads.without_folder(self._tabs.findings(incoming, found))
+            return self._uploads.without_folder(self._tabs.render_findings(incoming, found))
 
         return web.Response(text=await asyncio.to_thread(check), content_type="text/html")
 

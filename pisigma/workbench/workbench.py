@@ -153,7 +153,9 @@ class Workbench(UploadedRows):
     async def _page(self, request: web.Request) -> web.StreamResponse:
         def page() -> str:
             fault = self._fault()
-            return self._tabs.page(self.folder, self._cell() if fault is None else None, fault is not None)
+            return self._tabs.render_page(
+                self.folder, self._cell() if fault is None else None, fault is not None
+            )
 
         text = await asyncio.to_thread(page)
         return web.Response(text=text, content_type="text/html")
@@ -164,10 +166,10 @@ class Workbench(UploadedRows):
 
         def tab() -> str:
             if (fault := self._fault()) is not None:
-                return self._tabs.repair(self.folder, fault)
+                return self._tabs.render_repair_form(self.folder, fault)
             if (cell := self._cell()) is None or (status := self.status()) is None:
                 return self._tabs.render_new_cell_form(self.folder)
-            return self._tabs.tab(name, cell, status, self._texts)
+            return self._tabs.render_tab(name, cell, status, self._texts)
 
         if name not in TABS:
             raise web.HTTPNotFound

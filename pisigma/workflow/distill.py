@@ -69,7 +69,7 @@ class Distillation(AbstractModelResult):
         parent: the model from which it was distilled.
         region: region of the poses.
         held_out: poses that were used neither for fitting nor for model selection.
-        predicted: corrections that the network adds to their nominal joint values [rad or m].
+        predicted_corrections: corrections that the network adds to their nominal joint values [rad or m].
         summary: all figures.
         seconds: computing time [s].
     """
@@ -78,7 +78,7 @@ class Distillation(AbstractModelResult):
     parent: CalibratedModel
     region: Region
     held_out: SolvedPoses
-    predicted: Float64[Tensor, "poses dof"]
+    predicted_corrections: Float64[Tensor, "poses dof"]
     summary: DistillationSummary
     seconds: float
 

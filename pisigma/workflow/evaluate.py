@@ -150,9 +150,9 @@ def evaluate(
     compared = with_references(list(sources), loaded, rows.rotation is not None)
     hashes = everything.content_hash(), rows.content_hash()
     distances = matching_sockets(settings.socket_distances, rows.socket or ())
-    right = without_wrong_rows(loaded.values(), rows, settings.fitted)
+    right = without_wrong_rows(loaded.values(), rows, settings.fitted_kinds)
     rows = right.rows
-    comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted, distances)
+    comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted_kinds, distances)
     evaluated = {
         label: EvaluatedModel(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
         for label, model in loaded.items()
@@ -171,13 +171,13 @@ def evaluate(
             diagnostic
             for figures in judged
             for diagnostic in (
-                *_diagnostics(loaded[figures.name], figures, rows, settings.fitted),
+                *_diagnostics(loaded[figures.name], figures, rows, settings.fitted_kinds),
                 *distance_diagnostics(comparison, figures),
             )
         ),
         warnings=(
             *right.warnings,
-            *fitted_remark(rows, settings.fitted),
+            *fitted_remark(rows, settings.fitted_kinds),
             *fitted_points_remark(rows),
             *image_remark(rows),
             *_warnings(comparison),
@@ -256,20 +256,20 @@ def load_models(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel
 
 
 def with_references(
-    labels: Sequence[str], loaded: Mapping[str, CalibratedModel], with_orientation: bool
+    labels: Sequence[str], loaded_models: Mapping[str, CalibratedModel], with_orientation: bool
 ) -> dict[str, CalibratedModel]:
     """Add the references to the models, in the given order; "nominal" comes before a single model.
 
     Args:
         labels: names of models and references.
-        loaded: the models without the references.
+        loaded_models: the models without the references.
         with_orientation: whether orientations were measured, so that the nominal robot's tool is fitted to them.
     """
-    first = next(iter(loaded.values()))
-    identified = next((model for model in loaded.values() if model.calibrated is not None), first)
+    first = next(iter(loaded_models.values()))
+    identified = next((model for model in loaded_models.values() if model.calibrated is not None), first)
     models = {}
     for label in ["nominal", *labels] if len(labels) == 1 else labels:
-        model = loaded.get(label)
+        model = loaded_models.get(label)
         if model is None:
             is_nominal = label == "nominal"
             model = nominal_model(first, with_orientation) if is_nominal else geometric_model(identified)

@@ -9,7 +9,13 @@ from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements, with_new_frames
-from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, count_rows, sentences
+from pisigma.measurement.foreign.accounting import (
+    FileAccount,
+    FileLine,
+    LeftOutRow,
+    count_rows,
+    left_out_sentences,
+)
 from pisigma.measurement.foreign.conversion import (
     ConvertedRows,
     MeasurementTable,
@@ -94,7 +100,7 @@ class ImportedRows:
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences about rows that are left out, with the reasons, and warnings."""
-        return (*sentences(self.left_out), *self.warnings)
+        return (*left_out_sentences(self.left_out), *self.warnings)
 
     @property
     def measurements(self) -> Measurements:

@@ -148,7 +148,7 @@ class MonitoringResult:
     def sentences(self) -> tuple[str, ...]:
         """Return results of all sessions as sentences: alarms, clear trends, the forecast, and the next step."""
         alarms = (
-            f"{'the RMS error' if chart.one_sided else chart.what} has been outside the limits "
+            f"{'the RMS error' if chart.one_sided else chart.quantity} has been outside the limits "
             f"({' and '.join(chart.kinds)}) since {self.records[chart.alarm].date}."
             for chart in self.charts
             if chart.alarm is not None
@@ -220,7 +220,7 @@ class MonitoringResult:
         marks: dict[str, list[tuple[datetime.date, str]]] = {}
         marks[""] = [(datetime.date.fromisoformat(one.day), one.kind) for one in events]
         for one in self.jumps:
-            marks.setdefault(one.what, []).append((datetime.date.fromisoformat(one.after), "jump"))
+            marks.setdefault(one.quantity, []).append((datetime.date.fromisoformat(one.after), "jump"))
         return marks
 
 
@@ -360,7 +360,7 @@ def _record(
     stated = RecalibrationSettings(settings.moved)
     file = Path(rows.source).name
     if implausible := check_rows_by_model(
-        rows, model, stated.fitted, allowed_moves(stated)
+        rows, model, stated.fitted_kinds, allowed_moves(stated)
     ).implausible_findings:
         return UntrustedSession(file, date, implausible)
     elsewhere = None if settings.moved is None else frame_keys(rows, settings.moved)

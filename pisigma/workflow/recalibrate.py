@@ -144,7 +144,7 @@ def recalibrate(
     rows, again = without_known_rows(parent, posterior.with_model_names(measurements.split_sets()[0]))
     progress("checking the rows")
     right = FilteredRows(rows) if parent.kind == FLEET_PRIOR else filtered_rows(settings, parent, rows)
-    verdict = check_rows(right.rows, parent, settings.fitted, allowed_moves(settings))
+    verdict = check_rows(right.rows, parent, settings.fitted_kinds, allowed_moves(settings))
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
@@ -328,7 +328,7 @@ def filtered_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
 ) -> FilteredRows:
     """Return the rows without single wrong rows, with base and tool fitted if these may have moved."""
-    right = without_wrong_rows([model], rows, settings.fitted)
+    right = without_wrong_rows([model], rows, settings.fitted_kinds)
     if right.warnings or settings.moved is not None:
         return right
     return without_wrong_rows([model], rows, fitted_kinds(fit_frame=True, fit_tool=True))

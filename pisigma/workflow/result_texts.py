@@ -7,8 +7,8 @@ from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_tab
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms_text
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
-from pisigma.reporting.result_text import ResultText, sentences, table_block
-from pisigma.reporting.verdict import Verdict, count_text, rounded, uncapitalised
+from pisigma.reporting.result_text import ResultText, sentence_block, table_block
+from pisigma.reporting.verdict import Verdict, count_text, rounded_text, uncapitalised
 from pisigma.workflow.monitor import MonitoringResult
 from pisigma.workflow.plan import Plan
 from pisigma.workflow.recalibrate import Recalibration
@@ -40,7 +40,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     """
     columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
     rows = [
-        (str(point.poses), *(rounded(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
+        (str(point.poses), *(rounded_text(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
         for point in planned.accuracy_curve
     ]
     title = "expected errors of the tool position by number of poses"
@@ -55,14 +55,16 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
         _plan_verdict(planned, files[0]),
         tuple(planned.warnings),
         (
-            sentences("criterion and limit", _curve_lines(planned)),
+            sentence_block("criterion and limit", _curve_lines(planned)),
             table_block(title, columns, list(dict.fromkeys(short))),
-            sentences("what remains uncertain", weak, "  "),
-            sentences("what limits a camera", () if planned.camera is None else planned.camera.sentences),
+            sentence_block("what remains uncertain", weak, "  "),
+            sentence_block(
+                "what limits a camera", () if planned.camera is None else planned.camera.sentences
+            ),
         ),
         (
             *([table_block(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
-            sentences("candidates and waypoints", lines),
+            sentence_block("candidates and waypoints", lines),
         ),
         (f"Written to {', '.join(map(str, files))}.",),
     )
@@ -75,8 +77,8 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     checked = f"; {count_text(planned.check_poses, 'pose')} will check it" if planned.check_poses else ""
     more = "" if planned.accuracy_curve[0].poses else "more "
     return Verdict(
-        f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm (95 %) expected for the tool position "
-        f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
+        f"{rounded_text(last.rms * 1e3)} mm RMS and {rounded_text(last.p95 * 1e3)} mm (95 %) expected for the tool "
+        f"position with {planned.poses} {more}poses; {rounded_text(last.random_rms * 1e3)} mm RMS with random poses.",
         f"{cautions}, if the sensor scatters as stated{checked}.",
         f"measure the poses, about {planned.duration / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
         f"{settings.settling_s:g} s per pose, with `pisigma measure {file} --rows ROWS.csv`.",
@@ -141,14 +143,14 @@ def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[st
     together = [one for one in monitoring.sentences if one != advice]
     details = (
         table_block(f"sessions of {name}", *session_table(sessions)),
-        sentences("what has changed in all sessions", said, "  "),
+        sentence_block("what has changed in all sessions", said, "  "),
     )
     return ResultText(
         _monitoring_verdict(monitoring, advice),
         tuple(monitoring.warnings),
         (
-            sentences("conclusions from all sessions", together),
-            sentences("what has changed", [*said[-_MAX_SESSIONS:], *unobservable], "  "),
+            sentence_block("conclusions from all sessions", together),
+            sentence_block("what has changed", [*said[-_MAX_SESSIONS:], *unobservable], "  "),
             table_block(f"last sessions of {name}", *session_table(sessions[-_MAX_SESSIONS:])),
             *([charts] if len(monitoring.records) > 1 else []),
         ),
@@ -161,8 +163,12 @@ def _monitoring_verdict(monitoring: MonitoringResult, advice: str) -> Verdict:
     """Return the verdict on a robot from its sessions; `advice` states how to recalibrate it if this is recommended."""
     sessions, untrusted = monitoring.sessions, len(monitoring.untrusted_sessions)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
-    last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
-    alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
+    last = (
+        f"{sessions[-1].date}, {rounded_text(sessions[-1].session.rms * 1e3, 0)} mm RMS"
+        if sessions
+        else "none"
+    )
+    alarms = [chart.quantity for chart in monitoring.charts if chart.alarm is not None]
     doubts = [f"changed in {len(changed)} of {count_text(len(sessions), 'session')}"] if changed else []
     doubts += [f"outside the limits of its chart: {', '.join(alarms)}"] if alarms else []
     doubts += [f"{count_text(untrusted, 'session')} left out"] if untrusted else []
@@ -189,7 +195,7 @@ def recalibration_text(recalibration: Recalibration, folder: Path | None) -> Res
         _recalibration_verdict(recalibration, folder),
         (*warnings, *(one.sentence for one in summary.outliers)),
         (
-            sentences("which model is kept", [summary.verdict]),
+            sentence_block("which model is kept", [summary.verdict]),
             table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
         ),
         closing_sentences=() if folder is None else (written,),
@@ -200,7 +206,9 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
     """Return the verdict on a recalibration."""
     summary, names = recalibration.summary, candidate_names(recalibration.summary)
     errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
-    texts = {name: f"{names[name]} {rounded(error, summary.left_out)} mm" for name, error in errors.items()}
+    texts = {
+        name: f"{names[name]} {rounded_text(error, summary.left_out)} mm" for name, error in errors.items()
+    }
     first = texts.pop(summary.kept, "not known: too few rows")
     others = f"; {', '.join(texts.values())}" if texts else ""
     count = len(summary.warnings) + len(summary.outliers)
@@ -234,13 +242,13 @@ def report_text(result: Report, closing_sentences: Sequence[str] = ()) -> Result
     elif not content.verdict.held_out:
         trust = "with caution: no held-out rows were judged."
     first, *others = content.advice or ("read the page.",)
-    blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
+    blocks = [sentence_block("further advice", (f"- {one}" for one in others), "  ")]
     if accepted is not None:
         columns, rows = budget_table(accepted)
-        lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated))
+        lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated_sentences))
         lines = (*acceptance_sentences(accepted), f"Not stated: {lacking}; see the page.")
         budget = ("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows])
-        blocks += [sentences("acceptance", lines, "  "), table_block(*budget)]
+        blocks += [sentence_block("acceptance", lines, "  "), table_block(*budget)]
     return ResultText(
         Verdict(result.verdict, trust, uncapitalised(first)),
         tuple(one.sentence for one in result.diagnostics[1:]),
@@ -251,6 +259,6 @@ def report_text(result: Report, closing_sentences: Sequence[str] = ()) -> Result
 
 def report_doubt(result: Report) -> str:
     """Return the reason why rows of a report must not be trusted or contradict the acceptance, or ""."""
-    if result.acceptance is not None and result.acceptance.contradicted and not result.diagnostics:
+    if result.acceptance is not None and result.acceptance.is_contradicted and not result.diagnostics:
         return contradiction_sentence(result.acceptance)
     return " ".join(one.sentence for one in result.diagnostics)

@@ -331,7 +331,7 @@ def cross_validate(
     ]
     comparisons = (task() for task in tasks) if jobs is None else run_in_processes(tasks, jobs)
     for (_, test), comparison in zip(folds, comparisons, strict=True):
-        not_predicted += comparison.not_predicted
+        not_predicted += comparison.rows_not_predicted
         nominal.set_rows(test, comparison.nominal)
         corrected.set_rows(test, comparison.corrected)
     return ComparisonFigures.from_comparison(Comparison(nominal, corrected, not_predicted), folds=len(folds))

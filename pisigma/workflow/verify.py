@@ -170,15 +170,15 @@ def verify(
     loaded, folder = loaded_model(model)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
     distances = matching_sockets(settings.socket_distances, rows.socket or ())
-    right = without_wrong_rows([loaded], rows, settings.fitted)
+    right = without_wrong_rows([loaded], rows, settings.fitted_kinds)
     rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
     resamples = int(np.clip(_MAX_RESAMPLED_ROWS // max(rows.rows, 1), *_RESAMPLES))
     bootstrap = Bootstrap(resamples, settings.seed)
-    comparison = compare_models(models, rows, bootstrap, settings.fitted, distances)
-    gate = check_rows(rows, loaded, settings.fitted, {"joint_zero"}, models[NOMINAL])
+    comparison = compare_models(models, rows, bootstrap, settings.fitted_kinds, distances)
+    gate = check_rows(rows, loaded, settings.fitted_kinds, {"joint_zero"}, models[NOMINAL])
     faults = gate.setup_faults
-    motion = _motion(loaded, rows, settings.fitted, comparison, faults)
+    motion = _motion(loaded, rows, settings.fitted_kinds, comparison, faults)
     mean = comparison.models[0].position.statistics["mean"]
     ratio = comparison.models[-1].position.statistics["mean"] / mean if mean > 0 else float("nan")
     difference = comparison.models[-1].position.difference
@@ -212,7 +212,7 @@ def verify(
             *right.warnings,
             *_warnings(loaded, rows, comparison, faults, motion),
             *([] if motion is None or verdict == "moved" else motion_warnings(motion)),
-            *fitted_remark(rows, settings.fitted),
+            *fitted_remark(rows, settings.fitted_kinds),
             *fitted_points_remark(rows),
             *image_remark(rows),
         ),
@@ -232,7 +232,7 @@ def _recalibration(name: str, data: str, settings: VerificationSettings, motion:
     """Return the command that updates a model; empty if a recalibration is not recommended."""
     if motion is None or not motion.recalibrate:
         return ""
-    return RecalibrationSettings(settings.fitted or None, settings.cameras).command(name, data)
+    return RecalibrationSettings(settings.fitted_kinds or None, settings.cameras).command(name, data)
 
 
 def _motion(

@@ -25,7 +25,7 @@ from pisigma.files.errors import (
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.calibration_text import calibration_text
-from pisigma.reporting.verdict import rounded
+from pisigma.reporting.verdict import rounded_text
 from pisigma.robot.kinematics.status import Status
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 
@@ -137,7 +137,12 @@ def test_people_read_the_verdict_first_and_everything_on_demand(capsys, calibrat
     folder, printed = calibrated
     summary = CalibrationSummary.read(load_model(folder))
     errors = printed["cross_validation"]["geometric"]
-    figures = f"{rounded(errors['rms_mm'], 60)} mm", f"{rounded(errors['p95_mm'], 60)}", "3-fold", "60 rows"
+    figures = (
+        f"{rounded_text(errors['rms_mm'], 60)} mm",
+        f"{rounded_text(errors['p95_mm'], 60)}",
+        "3-fold",
+        "60 rows",
+    )
     print_result(calibration_text(summary, folder, 1.0), verbose=False)
     text = capsys.readouterr().out
     assert_screen(text, *figures, "--verbose", str(folder))

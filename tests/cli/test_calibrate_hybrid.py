@@ -17,7 +17,7 @@ from pisigma.files.errors import IdentificationError, MeasurementError, RecipeEr
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.calibration_text import calibration_text
-from pisigma.reporting.verdict import rounded
+from pisigma.reporting.verdict import rounded_text
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
@@ -100,7 +100,7 @@ def test_people_read_the_verdict_and_what_was_tried_on_demand(capsys, calibrated
     summary = CalibrationSummary.read(load_model(folder))
     figures = printed["cross_validation"]
     words = (
-        f"{rounded(figures['hybrid']['rms_mm'], 200)} mm",
+        f"{rounded_text(figures['hybrid']['rms_mm'], 200)} mm",
         f"{100 * figures['coverage']:.0f} %",
         "200 rows",
     )

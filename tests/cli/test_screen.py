@@ -7,7 +7,7 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import MAX_LINES, print_screen
 from pisigma.files.progress import completed_fraction, step_name
 from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, numbers_as_ranges
-from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
+from pisigma.reporting.verdict import Verdict, rounded_text, uncapitalised
 
 VERDICT = Verdict("0.12 mm RMS, held out; nominal 1 mm.", "yes, for all: nothing is wrong.", "verify it.")
 
@@ -69,7 +69,7 @@ def test_ranges_of_numbers():
     ],
 )
 def test_errors_have_the_digits_that_they_deserve(value, rows, text):
-    assert rounded(value, rows) == text
+    assert rounded_text(value, rows) == text
 
 
 def test_a_sentence_continues_another():

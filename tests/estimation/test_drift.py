@@ -46,7 +46,7 @@ def dense_evidence(looked_at: DriftSearch, sizes: list[float]) -> float:
 
 def test_only_what_moved_has_a_size():
     drift = estimated(search(MOVED))
-    sizes = {group.what: group.size for group in drift.groups}
+    sizes = {group.name: group.size for group in drift.groups}
     assert [what for what, size in sizes.items() if size] == ["joint 2"]
     assert_close(math.log10(sizes["joint 2"]), math.log10(MOVED), atol=0.3)
     assert_close(drift.noise[0], NOISE, rtol=0.3)

@@ -96,8 +96,8 @@ class KilledCell:
             return f"{lost} changed, {gone} are gone"
         opened = Cell.open(self.cell.folder)
         status = opened.status()
-        if status.facts.edited:
-            return f"sessions {status.facts.edited} differ from what was added"
+        if status.facts.edited_sessions:
+            return f"sessions {status.facts.edited_sessions} differ from what was added"
         for one in opened.history.models():
             load_model(opened.model_folder(one.name))
         return "" if opened.model is not None else "no model is in use any more"

@@ -1,7 +1,7 @@
 """Sentences and cards from templates."""
 
 from pisigma.files.model_files import CARD
-from pisigma.reporting.rendering import sentences, write_card
+from pisigma.reporting.rendering import render_sentences, write_card
 from pisigma.validation.held_out.calibration_summary import NoiseFigures, OutlierFigures
 
 
@@ -10,7 +10,7 @@ def outlier(row):
 
 
 def test_paragraphs_of_a_macro_are_sentences_of_their_own():
-    direction, first = sentences("report.txt.j2", "weak_parameters", ["a + b is weak."], ["c_1"], "2")
+    direction, first = render_sentences("report.txt.j2", "weak_parameters", ["a + b is weak."], ["c_1"], "2")
     assert "a + b is weak." in direction
     assert first.startswith("c_1:")
     assert direction.endswith(".")
@@ -18,8 +18,8 @@ def test_paragraphs_of_a_macro_are_sentences_of_their_own():
 
 
 def test_a_macro_may_be_empty():
-    assert sentences("report.txt.j2", "outliers", []) == ()
-    (text,) = sentences("report.txt.j2", "outliers", [outlier(row) for row in range(2, 7)])
+    assert render_sentences("report.txt.j2", "outliers", []) == ()
+    (text,) = render_sentences("report.txt.j2", "outliers", [outlier(row) for row in range(2, 7)])
     assert text.startswith("5 ")
     assert text.endswith("(a.csv, line 2, a.csv, line 3, a.csv, line 4).")
 

@@ -11,11 +11,11 @@ from testing.models import joints_around
 
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.programs.text import (
-    labelled,
+    format_labelled,
+    format_numbers,
     metres_and_rotation_vector,
-    millimetres,
     millimetres_and_euler,
-    numbers,
+    position_in_mm,
     quaternion,
 )
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
@@ -44,11 +44,11 @@ class Language:
 
 
 def xyzabc_text(T: Frame) -> str:
-    return labelled(millimetres_and_euler(T).tolist(), "XYZABC")
+    return format_labelled(millimetres_and_euler(T).tolist(), "XYZABC")
 
 
 def place_of(T: Frame) -> str:
-    return f"{numbers(millimetres(T))}], [{numbers(quaternion(T), 9)}"
+    return f"{format_numbers(position_in_mm(T))}], [{format_numbers(quaternion(T), 9)}"
 
 
 def position(number: int) -> Callable[[Frame], str]:
@@ -65,7 +65,7 @@ def position(number: int) -> Callable[[Frame], str]:
 LANGUAGES = [
     Language(
         ".script",
-        lambda T: f"p[{numbers(metres_and_rotation_vector(T), 9)}]",
+        lambda T: f"p[{format_numbers(metres_and_rotation_vector(T), 9)}]",
         """def cell():
   # movel(p[1, 2, 3, 4, 5, 6]) "is a remark"
   set_tcp({tool})

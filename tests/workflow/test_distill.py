@@ -80,7 +80,7 @@ def test_the_tool_is_close_to_the_full_solution(kind, name, share):
     poses = found.held_out
     assert_close(tool_errors(found, poses.q_nominal + poses.correction), 0.0, atol=1e-9)
     nominal = tool_errors(found, poses.q_nominal).square().mean().sqrt()
-    rms = tool_errors(found, poses.q_nominal + found.predicted).square().mean().sqrt()
+    rms = tool_errors(found, poses.q_nominal + found.predicted_corrections).square().mean().sqrt()
     assert float(nominal) > 4e-4
     assert float(rms) < share * float(nominal)
 
@@ -88,7 +88,7 @@ def test_the_tool_is_close_to_the_full_solution(kind, name, share):
 def test_overtones_follow_what_sines_and_cosines_cannot():
     plain, rich = (distilled("hybrid", "kiro3", NetworkSize((1, 2), harmonics)) for harmonics in (1, 24))
     errors = [
-        float(tool_errors(f, f.held_out.q_nominal + f.predicted).square().mean().sqrt())
+        float(tool_errors(f, f.held_out.q_nominal + f.predicted_corrections).square().mean().sqrt())
         for f in (plain, rich)
     ]
     assert errors[1] < 0.3 * errors[0]
@@ -111,7 +111,7 @@ def test_a_folder_gives_the_same_corrections(size, tmp_path):
     solution = ik(poses.T)
     assert ik.model.kind == "distilled"
     assert_close(solution.q_nominal, poses.q_nominal, atol=1e-9)
-    assert_close(solution.q, poses.q_nominal + found.predicted, atol=1e-9)
+    assert_close(solution.q, poses.q_nominal + found.predicted_corrections, atol=1e-9)
     assert float((solution.status == Status.REACHED).double().mean()) > 0.95
     if size.harmonics > 1:
         arrays = ik(poses.T.numpy())
@@ -137,13 +137,13 @@ def test_a_region_of_positions_holds_all_poses():
     for axis in range(3):
         assert float(place[:, axis].min()) >= BOX[2 * axis]
         assert float(place[:, axis].max()) <= BOX[2 * axis + 1]
-    assert float(tool_errors(found, found.held_out.q_nominal + found.predicted).max()) < 2e-4
+    assert float(tool_errors(found, found.held_out.q_nominal + found.predicted_corrections).max()) < 2e-4
 
 
 def test_a_given_seed_gives_the_same_model():
     settings = DistillationSettings(poses=200, size=NetworkSize((1, 2)), seed=4, epochs=5)
     first, second = (distill(geometric_model("kiro3"), settings) for _ in range(2))
-    assert_close(first.predicted, second.predicted)
+    assert_close(first.predicted_corrections, second.predicted_corrections)
     other = distill(geometric_model("kiro3"), replace(settings, seed=5))
     assert not torch.equal(first.held_out.T, other.held_out.T)
 
@@ -188,10 +188,10 @@ def test_between_takes_the_shorter_direction():
 def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
     found = distilled("hybrid", "kiro3", NetworkSize((1, 2, 3)))
     summary = found.summary
-    errors = tool_errors(found, found.held_out.q_nominal + found.predicted) * 1e3
+    errors = tool_errors(found, found.held_out.q_nominal + found.predicted_corrections) * 1e3
     assert_close(summary.held_out.distilled.rms_mm, errors.square().mean().sqrt(), rtol=1e-9)
     assert_close(summary.held_out.distilled.max_mm, errors.max(), rtol=1e-9)
-    off = (found.predicted - found.held_out.correction)[:, 0].abs().rad2deg()
+    off = (found.predicted_corrections - found.held_out.correction)[:, 0].abs().rad2deg()
     assert_close(summary.joints[0].error.max, off.max(), rtol=1e-9)
     assert_close(
         summary.joints[2].correction.mean,

@@ -31,7 +31,7 @@ def test_rows_of_several_days_are_several_sessions():
     assert [one.date for one in monitoring.sessions] == ["2026-01-01", "2026-02-01", "2026-03-01"]
     assert [one.session.rows for one in monitoring.sessions] == [6, 6, 6]
     assert not monitoring.needs_action
-    assert [chart.what for chart in monitoring.charts][-2:] == ["joint 6", "error"]
+    assert [chart.quantity for chart in monitoring.charts][-2:] == ["joint 6", "error"]
 
 
 def test_an_instrument_that_was_moved_raises_no_alarm():

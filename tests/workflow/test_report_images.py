@@ -42,7 +42,7 @@ def test_predictions_are_those_of_both_arms(arm):
     found = arm_in_images(model, rows, cameras, files)
     assert {one.name for one in found.images} == {file.stem for file in files}
     assert found.nominal_rms > 2 * found.calibrated_rms
-    assert found.halvings == pytest.approx(math.log2(found.nominal_rms / found.calibrated_rms))
+    assert found.error_halvings == pytest.approx(math.log2(found.nominal_rms / found.calibrated_rms))
     for one in found.images:
         assert one.measured_corners.shape == (len(BOARD.corners), 2)
         # corner 0 is the origin of the tool, at which the links end

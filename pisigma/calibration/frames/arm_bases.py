@@ -163,11 +163,11 @@ class ArmBases:
         """Return the number of joints of a torso that two arms share."""
         return shared_joint_count(self.arms[first], self.arms[second])
 
-    def reference_arm(self, number: int) -> int:
+    def reference_arm(self, arm_index: int) -> int:
         """Return the index of the arm whose base and shared joints an arm has."""
-        while (before := most_shared_joints(self.arms)[number][0]) != number:
-            number = before
-        return number
+        while (before := most_shared_joints(self.arms)[arm_index][0]) != arm_index:
+            arm_index = before
+        return arm_index
 
     @cached_property
     def updated_arms(self) -> tuple[ArmPosterior, ...]:

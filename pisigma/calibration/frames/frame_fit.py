@@ -74,7 +74,7 @@ class FrameFit:
     """Base, tool or both, fitted with the arm held fixed.
 
     Attributes:
-        only: what was fitted.
+        frame_choice: what was fitted.
         solved: the least-squares problem of the rows used, with its solution.
         rows: all rows.
         used_rows: indices of the rows used.
@@ -83,7 +83,7 @@ class FrameFit:
         tools: previous tools by target; other targets use the tool of the robot.
     """
 
-    only: FrameChoice
+    frame_choice: FrameChoice
     solved: SolvedCalibration
     rows: Measurements
     used_rows: tuple[int, ...]
@@ -183,7 +183,7 @@ class FrameFit:
 def fit_frames(
     robot: Robot,
     rows: Measurements,
-    only: FrameChoice,
+    frame_choice: FrameChoice,
     bases: Frames = _NO_FRAMES,
     tools: Frames = _NO_FRAMES,
 ) -> FrameFit:
@@ -196,7 +196,7 @@ def fit_frames(
     Args:
         robot: robot with the fixed arm, and with the base or tool that is not fitted.
         rows: touches, positions, poses or images; sockets are points at unknown positions.
-        only: what to fit; the tool's orientation only if rows have orientations.
+        frame_choice: what to fit; the tool's orientation only if rows have orientations.
         bases: bases of named frames that differ from the base of the robot.
         tools: tools of named targets that differ from the tool of the robot.
 
@@ -206,26 +206,26 @@ def fit_frames(
         PoseError: the joint values do not fit the robot.
     """
     bases = {name: bases[name] for name in set(rows.frame) & set(bases)}
-    if only == "tool":
+    if frame_choice == "tool":
         _refuse_several("frame", set(rows.frame), bases, rows)
-    if only == "base":
+    if frame_choice == "base":
         _refuse_several("target", set(rows.target), {}, rows)
         robot = robot.with_geometry(tool=tools.get(rows.target[0], robot.tool))
     turned = bool({"pose", "rotation"} & set(rows.kinds))
     calibrator = GeometricCalibrator(
         robot,
         free=(),
-        base="fixed" if only == "tool" else "free",
-        tool="fixed" if only == "base" else "free" if turned else "position",
+        base="fixed" if frame_choice == "tool" else "free",
+        tool="fixed" if frame_choice == "base" else "free" if turned else "position",
         elimination="none",
         prior=None,
         loss=SquaredLoss(),
-        base_guesses={name: tuple(base) for name, base in bases.items()} if only == "tool" else {},
+        base_guesses={name: tuple(base) for name, base in bases.items()} if frame_choice == "tool" else {},
     )
     used, wrong = list(range(rows.rows)), list[int]()
     while True:
         free = calibrator.solve(rows.select(torch.tensor(used)) if wrong else rows)
-        if only != "tool" and (floating := floating_frames(free.setup)):
+        if frame_choice != "tool" and (floating := floating_frames(free.setup)):
             raise IdentificationError(
                 expected="rows at stated positions, which determine the base",
                 value=Phrase(", ".join(sorted(rows.kinds))),
@@ -235,7 +235,7 @@ def fit_frames(
                 "tool only (--only tool)",
             )
         solved = hold_undetermined(free, _frames(free), bases, tools)
-        fit = FrameFit(only, solved, rows, tuple(used), tuple(wrong), bases, tools)
+        fit = FrameFit(frame_choice, solved, rows, tuple(used), tuple(wrong), bases, tools)
         if (number := _wrong_row(fit)) is None:
             return fit
         used.remove(number)
@@ -345,7 +345,11 @@ def _contradicts(held: SolvedCalibration, free: SolvedCalibration) -> bool:
     """Return whether the residuals are much larger with directions held than with all directions free."""
     variances = sensor_view_of(free.refined_linearisation).variances
     squares = [
-        float((torch.stack([part.distance.square().sum() for part in view.contributions]) / variances).sum())
+        float(
+            (
+                torch.stack([part.residual_length.square().sum() for part in view.contributions]) / variances
+            ).sum()
+        )
         for view in (sensor_view_of(held.solution.linearisation), sensor_view_of(free.solution.linearisation))
     ]
     return held.solution.status != SolutionStatus.EXACT and squares[0] > _CONTRADICTED**2 * squares[1]

@@ -61,7 +61,7 @@ def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> t
         The causes, those supported by the evidence first; none if there are fewer than `_MIN_ROWS` poses.
     """
     rows = fit.rows.select(torch.tensor(fit.used_rows))
-    if fit.only != "hand-eye" or rows.rows < _MIN_ROWS or not fit.solved.problem.needs_rotation:
+    if fit.frame_choice != "hand-eye" or rows.rows < _MIN_ROWS or not fit.solved.problem.needs_rotation:
         return ()
     counted = {"camera": set(cameras(rows) or ()), "board": set(boards(rows) or ())}
     robot = fit.solved.problem.space.robot

@@ -153,7 +153,10 @@ class GeometricCalibrator:
         rough, findings, active = self._solve_roughly(setup, findings, candidates, active)
         problem = setup.problem.with_active(active)
         start = rough.linearisation
-        if findings.added_parameters or len(sensor_view_of(start).contributions[0].distance) < problem.rows:
+        if (
+            findings.added_parameters
+            or len(sensor_view_of(start).contributions[0].residual_length) < problem.rows
+        ):
             start = problem.linearise(start.point, start)
         else:
             start = problem.combine_contributions(start.point, sensor_view_of(start))

@@ -349,7 +349,7 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
     view = sensor_view_of(solved.refined_linearisation)
     for number, (sensor, part) in enumerate(zip(solved.problem.sensors, view.contributions, strict=True)):
-        deviations = part.distance / view.scales[number]
+        deviations = part.residual_length / view.scales[number]
         weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
         found += outliers_of(

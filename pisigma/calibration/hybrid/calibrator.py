@@ -44,7 +44,7 @@ from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import Direction
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_by_name
-from pisigma.measurement.conditions import stated_conditions
+from pisigma.measurement.conditions import varying_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
 from pisigma.robot.description import Robot
@@ -246,7 +246,7 @@ class HybridCalibrator:
         Raises:
             IdentificationError: two features have several sizes.
         """
-        varying = stated_conditions(solved.setup.measurements)
+        varying = varying_conditions(solved.setup.measurements)
         options = FeatureOptions(
             self.harmonics, gravity, int(groups_of_equal_joints(problem.q).max()) + 1, varying
         )

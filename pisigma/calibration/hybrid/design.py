@@ -55,10 +55,10 @@ class Design:
         """Number of unknowns."""
         return self.active_count + sum(int(chosen.used.sum()) for chosen in self.features)
 
-    def weights_of(self, number: int) -> slice:
+    def weights_of(self, feature_index: int) -> slice:
         """Return the indices of the weights of a feature."""
-        start = self.active_count + sum(int(chosen.used.sum()) for chosen in self.features[:number])
-        return slice(start, start + int(self.features[number].used.sum()))
+        start = self.active_count + sum(int(chosen.used.sum()) for chosen in self.features[:feature_index])
+        return slice(start, start + int(self.features[feature_index].used.sum()))
 
     def correction(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
         """Compute the joint corrections [rad or m] of rows for given unknowns."""

@@ -12,7 +12,7 @@ from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
-from pisigma.reporting.result_text import sentences, table_block
+from pisigma.reporting.result_text import sentence_block, table_block
 from pisigma.workflow.settings.fleet import FleetSettings
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
             table_block(
                 f"parameters that {summary.robots} robots have in common", *common_error_table(summary)
             ),
-            sentences("undetermined parameters", [UNDETERMINED]),
+            sentence_block("undetermined parameters", [UNDETERMINED]),
         ],
         [f"Model written to {out} in {result.seconds:.1f} s; its README.md has all figures."],
         verbose,
@@ -155,7 +155,8 @@ def _print_run(result: "FleetRun") -> None:
     refused, folder = len(result.refused), result.results.parent
     unchanged = f"; nothing was due in {result.unchanged}" if result.unchanged else ""
     verdict = Verdict(
-        f"{result.cells_done} of {count_text(result.cells, 'cell')} are done{unchanged}; {result.seconds:.1f} s.",
+        f"{result.cells_not_refused} of {count_text(result.cells, 'cell')} are done{unchanged}; "
+        f"{result.seconds:.1f} s.",
         f"no: {count_text(refused, 'cell')} need attention."
         if refused
         else "see `pisigma fleet status` for the errors of each robot.",
@@ -188,7 +189,7 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
         ],
         [
             table_block("all cells", *cell_table([] if few else seen.cells)),
-            sentences("meaning of the errors", [ERRORS_NOTE] if worst else []),
+            sentence_block("meaning of the errors", [ERRORS_NOTE] if worst else []),
         ],
         [] if page is None else [f"Page written to {page}."],
         verbose,

@@ -10,7 +10,7 @@ from pisigma.cli.images.detect import BoardFile
 from pisigma.cli.images.result import Page, check_outputs, trust_text, write_result
 from pisigma.cli.progress import progress_of
 from pisigma.cli.settings_options import takes_settings
-from pisigma.reporting.verdict import Verdict, rounded
+from pisigma.reporting.verdict import Verdict, rounded_text
 from pisigma.workflow.settings.images import IntrinsicsSettings
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def _verdict(calibrated: "CameraCalibration", out: Path) -> Verdict:
     detection, covered = calibrated.detection, calibrated.calibration.covered_cells.mean()
     _, fx, sigma, _ = calibrated.parameters[0]
     return Verdict(
-        f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
+        f"corners fit to {rounded_text(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
         f"{len(detection.images)} images; focal length {fx:.5g} +- {sigma:.2g} px.",
         trust_text(
             len(calibrated.warnings), f"yes: corners cover {100 * covered:.0f} % of the cells of the image."

@@ -10,7 +10,7 @@ from pisigma.cli.images.result import Page, check_outputs, trust_text, write_res
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
 from pisigma.cli.settings_options import takes_settings
-from pisigma.reporting.verdict import Verdict, rounded
+from pisigma.reporting.verdict import Verdict, rounded_text
 from pisigma.workflow.settings.images import DetectionSettings
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _verdict(detected: "DetectedCorners", out: Path, camera: Path, board: Path) 
     warnings = len(detected.warnings) + len(detection.left_out)
     joints = "" if detected.joints else "add the joint values, then "
     return Verdict(
-        f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
+        f"corners fit to {rounded_text(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
         f"{len(detection.images)} images.",
         trust_text(warnings, "yes: every image shows the board."),
         f"{joints}run `pisigma calibrate ROBOT {out} --camera {camera} --board {board} --out DIR`.",

@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.output import print_json
 from pisigma.cli.screen import print_screen
-from pisigma.reporting.result_text import sentences, table_block
+from pisigma.reporting.result_text import sentence_block, table_block
 from pisigma.reporting.verdict import Verdict, count_text
 
 if TYPE_CHECKING:
@@ -50,12 +50,14 @@ def write_result(
         verdict,
         [*result.warnings, *left_out],
         [table_block(title, *cells) for title, cells in result.tables],
-        [sentences("remarks on the images", result.sentences)],
+        [sentence_block("remarks on the images", result.sentences)],
         [f"Written to {written}."],
         verbose,
     )
 
 
-def trust_text(warnings: int, otherwise: str) -> str:
+def trust_text(warning_count: int, text_without_warnings: str) -> str:
     """Return a sentence on whether to trust a result with a number of warnings."""
-    return f"with caution ({count_text(warnings, 'warning')})." if warnings else otherwise
+    return (
+        f"with caution ({count_text(warning_count, 'warning')})." if warning_count else text_without_warnings
+    )

@@ -12,8 +12,8 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, count_text, rounded
+from pisigma.reporting.result_text import sentence_block, table_block
+from pisigma.reporting.verdict import Verdict, count_text, rounded_text
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
     )
     head, rows = pose_rows(distances)
     blocks = [
-        sentences("what differs", compared.sentences),
+        sentence_block("what differs", compared.sentences),
         *short,
         table_block("distances of the tool", head, [row for row in rows if "mean" not in row[0]]),
         table_block(f"parameters of {first} (A) and {second} (B)", *parameters),
@@ -130,8 +130,8 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     else:
         trust = f"{which}; {f'{better} predicts' if better else 'neither clearly predicts'} the rows better."
     return Verdict(
-        f"over the workspace, {second} places the tool {rounded(errors['rms_mm'])} mm RMS from where {first} "
-        f"places it, {rounded(errors['max_mm'])} mm at most.",
+        f"over the workspace, {second} places the tool {rounded_text(errors['rms_mm'])} mm RMS from where {first} "
+        f"places it, {rounded_text(errors['max_mm'])} mm at most.",
         trust,
         "measure rows and compare again with --rows."
         if compared.rows is None

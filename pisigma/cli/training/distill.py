@@ -14,7 +14,7 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
-from pisigma.reporting.result_text import sentences, table_block
+from pisigma.reporting.result_text import sentence_block, table_block
 from pisigma.reporting.verdict import Verdict, count_text, rms_text
 from pisigma.workflow.settings.distillation import DistillationSettings
 
@@ -150,7 +150,7 @@ def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool
             "absolute joint corrections, and errors of the distilled ones", *correction_table(summary)
         ),
         table_block("sizes tried", *size_table(summary)),
-        sentences("limitations", summary.limitations),
+        sentence_block("limitations", summary.limitations),
     ]
     closing = [f"Model written to {out} in {distillation.seconds:.1f} s; its README.md has all figures."]
     print_screen(verdict, summary.warnings, blocks, details, closing, verbose)

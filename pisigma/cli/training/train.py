@@ -17,7 +17,7 @@ from pisigma.cli.screen import print_result, print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import make_printable
 from pisigma.reporting.result_text import Block, table_block
-from pisigma.reporting.verdict import Verdict, rms_text, rounded, uncapitalised
+from pisigma.reporting.verdict import Verdict, rms_text, rounded_text, uncapitalised
 from pisigma.workflow.settings.training import TrainSettings
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _worst_joint(summary: "TrainingSummary") -> str:
         return "not known, because no row was judged"
     name, (worst, is_fit) = max(known.items(), key=lambda one: one[1][0].after.values[0])  # type: ignore[union-attr]
     assert worst is not None
-    after, before = (rounded(one.values[0]) for one in (worst.after, worst.before))
+    after, before = (rounded_text(one.values[0]) for one in (worst.after, worst.before))
     kind = "fit to the training rows" if is_fit else "held-out simulated rows"
     return f"{after} {worst.after.unit} mean error of the worst joint, {name}, {kind}; {before} before the correction"
 

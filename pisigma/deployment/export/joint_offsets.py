@@ -96,12 +96,13 @@ _MEANING = (
 )
 
 
-def departure_sentence(what: str, departure: Departure, nominal: Departure) -> str:
+def departure_sentence(subject_and_verb: str, departure: Departure, nominal: Departure) -> str:
     """Return a sentence on the deviation from the whole model, compared with that of the nominal robot."""
     return (
-        f"{what} from the whole model by {departure.mean_mm:.4g} mm on average, {departure.p95_mm:.4g} mm at the 95 % "
-        f"quantile, {departure.max_mm:.4g} mm at most, and {departure.mean_mrad:.4g} mrad on average (the nominal "
-        f"robot with the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm "
+        f"{subject_and_verb} from the whole model by {departure.mean_mm:.4g} mm on average, "
+        f"{departure.p95_mm:.4g} mm at the 95 % quantile, {departure.max_mm:.4g} mm at most, "
+        f"and {departure.mean_mrad:.4g} mrad on average (the nominal robot with "
+        f"the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm "
         f"and {nominal.mean_mrad:.4g} mrad)."
     )
 

@@ -50,7 +50,7 @@ TEST = (
 )
 
 
-def sentences(targets: Targets) -> tuple[str, ...]:
+def target_comments(targets: Targets) -> tuple[str, ...]:
     """Return the comments at the top of the table."""
     frames = {
         part: ", ".join(
@@ -89,7 +89,7 @@ def targets_csv(targets: Targets) -> str:
     for line, status, branch, row in zip(targets.line, targets.status, targets.branch, values, strict=True):
         cells = ["" if math.isnan(value) else repr(value) for value in row]
         writer.writerow([line, status.name.lower(), branch, *cells])
-    return header_comment(sentences(targets)) + text.getvalue()
+    return header_comment(target_comments(targets)) + text.getvalue()
 
 
 def _check(request: ExportRequest) -> None:

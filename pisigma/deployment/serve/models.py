@@ -296,7 +296,7 @@ class ServedModels:
         A model that cannot be reloaded continues to answer as before.
         """
         if self._in_use is not None:
-            self._in_use.check(retry=True)
+            self._in_use.check(retry_failed=True)
             return list(self._in_use.warnings)
         with self._lock:
             problems: list[str] = []

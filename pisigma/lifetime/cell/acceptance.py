@@ -69,8 +69,8 @@ class Acceptance:
         budget: uncertainty budget.
         measured: errors on the newest session to which the model was not fitted; None if there is no such session.
         repeats: ISO 9283 figures of the poses that were measured more than once in valid sessions.
-        accepted: acceptances of models of this cell, newest last.
-        missing: missing statements, one sentence each, apart from components of the budget.
+        acceptance_events: acceptances of models of this cell, newest last.
+        missing_statements: missing statements, one sentence each, apart from components of the budget.
     """
 
     model: str
@@ -81,8 +81,8 @@ class Acceptance:
     budget: UncertaintyBudget
     measured: MeasuredAccuracy | None
     repeats: tuple[RepeatedPose, ...]
-    accepted: tuple[Event, ...]
-    missing: tuple[str, ...]
+    acceptance_events: tuple[Event, ...]
+    missing_statements: tuple[str, ...]
 
     @property
     def temperature_span(self) -> tuple[float, float] | None:
@@ -91,7 +91,7 @@ class Acceptance:
         return (min(known), max(known)) if known else None
 
     @property
-    def contradicted(self) -> bool:
+    def is_contradicted(self) -> bool:
         """Whether the measured errors are larger than the budget and chance explain.
 
         It is False for a budget without the scatter of the calibration. Otherwise the ratio of the mean square of the
@@ -108,9 +108,9 @@ class Acceptance:
         return square > limit * self.budget.combined_uncertainty**2
 
     @property
-    def not_stated(self) -> tuple[str, ...]:
+    def not_stated_sentences(self) -> tuple[str, ...]:
         """Sentences about everything that is not stated."""
-        return (*self.budget.missing, *self.missing)
+        return (*self.budget.missing_components, *self.missing_statements)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, lengths in mm."""
@@ -122,14 +122,14 @@ class Acceptance:
             "repeatability_mm": self.repeatability_mm,
             "temperature_c": None if span is None else list(span),
             "budget": self.budget.to_json(),
-            "contradicted": self.contradicted,
+            "contradicted": self.is_contradicted,
             "measured": None if self.measured is None else self.measured.to_json(),
             "repeats": {}
             if scatter is None
             else {"deviation_mm": scatter[0] * 1e3, "degrees_of_freedom": scatter[1]},
             "iso9283": [one.to_json() for one in self.repeats],
-            "accepted": [one.to_json() for one in self.accepted],
-            "not_stated": list(self.not_stated),
+            "accepted": [one.to_json() for one in self.acceptance_events],
+            "not_stated": list(self.not_stated_sentences),
         }
 
 

@@ -117,7 +117,7 @@ class Controller:
         """Return the controller of a cell."""
         return Controller(history.controller(), history.exports())
 
-    def active(self, day: str = "9999", time: str = "") -> dict[Contents, ActiveExport]:
+    def active_exports(self, day: str = "9999", time: str = "") -> dict[Contents, ActiveExport]:
         """Return the exports that were active at the end of a day, by contents.
 
         Args:
@@ -137,18 +137,18 @@ class Controller:
 
     def active_during(self, session: SessionEntry) -> dict[Contents, ActiveExport]:
         """Return the exports that were active during a session; on its day, only those recorded before it was added."""
-        return self.active(session.day, session.taken_in)
+        return self.active_exports(session.day, session.taken_in)
 
     @property
     def zero_changes(self) -> tuple[ControllerEntry, ...]:
         """Changes of the joint zeros."""
-        hashes = [_hash(self.active(one.day, one.recorded)) for one in self.changes]
+        hashes = [_hash(self.active_exports(one.day, one.recorded)) for one in self.changes]
         pairs = zip(self.changes, ["", *hashes], hashes, strict=False)
         return tuple(one for one, before, after in pairs if before != after)
 
     def matches_session(self, session: SessionEntry) -> bool:
         """Return whether a session was measured with the joint zeros that are active now."""
-        return _hash(self.active_during(session)) == _hash(self.active())
+        return _hash(self.active_during(session)) == _hash(self.active_exports())
 
     def active_when_fitted(
         self, model: ModelEntry, sessions: tuple[SessionEntry, ...]
@@ -158,12 +158,12 @@ class Controller:
         return (
             self.active_during(newest[0])
             if newest
-            else self.active(model.day or day_of(model.made), model.made)
+            else self.active_exports(model.day or day_of(model.made), model.made)
         )
 
     def fits(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
         """Return whether the joint zeros that are active now are those with which the rows of a model were measured."""
-        return _hash(self.active_when_fitted(model, sessions)) == _hash(self.active())
+        return _hash(self.active_when_fitted(model, sessions)) == _hash(self.active_exports())
 
     def findings(
         self,
@@ -180,7 +180,7 @@ class Controller:
             sessions: all sessions of the cell.
             active: exports that were active when the rows were measured; None for the exports that are active now.
         """
-        present = self.active() if active is None else active
+        present = self.active_exports() if active is None else active
         behind = present if model is None else self.active_when_fitted(model, sessions)
         which: dict[Situation, str] = {}
         if "kinematics" in present:

@@ -182,7 +182,7 @@ class Database:
     import_earlier_data: Callable[[sqlite3.Connection], Sequence[Path]]
     _snapshot: list[sqlite3.Connection] = field(default_factory=list, repr=False, compare=False)
 
-    def add(self, rows: Sequence[Any]) -> None:
+    def add_or_replace(self, rows: Sequence[Any]) -> None:
         """Add rows in one transaction; a row with the same key is replaced.
 
         Raises:

@@ -46,7 +46,7 @@ class CellFacts:
         folder: folder of the cell, as the user named it.
         plans: names of the plans.
         sessions: all sessions in the order of their days.
-        edited: names of sessions whose files were changed or removed after they were added.
+        edited_sessions: names of sessions whose files were changed or removed after they were added.
         events: all events in the order of their days.
         models: all models in the order in which they were made.
         checks: all checks in the order in which they were made.
@@ -59,7 +59,7 @@ class CellFacts:
         settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
         changed_models: names of the model in use and of the newest model, if these were changed or removed after they
             were made.
-        incomplete: number of measured poses of the newest plan as text, if there are too few; otherwise "".
+        measured_pose_text: number of measured poses of the newest plan as text, if there are too few; otherwise "".
         controller: exports that were active on the controller, with the times.
         has_several_arms: whether `cell.yaml` lists several arms, for which no steps are kept.
     """
@@ -67,7 +67,7 @@ class CellFacts:
     folder: str
     plans: tuple[str, ...]
     sessions: tuple[SessionEntry, ...]
-    edited: tuple[str, ...]
+    edited_sessions: tuple[str, ...]
     events: tuple[Event, ...]
     models: tuple[ModelEntry, ...]
     checks: tuple[Check, ...]
@@ -79,7 +79,7 @@ class CellFacts:
     no_plan_reason: str = ""
     settings_sha256: str = ""
     changed_models: tuple[str, ...] = ()
-    incomplete: str = ""
+    measured_pose_text: str = ""
     controller: Controller = field(default_factory=Controller)
     has_several_arms: bool = False
 
@@ -212,7 +212,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
         folder=os.fspath(folder),
         plans=tuple(sorted(path.stem for path in (folder / PLANS).glob("*.csv"))),
         sessions=sessions,
-        edited=edited_sessions(folder / SESSIONS, sessions),
+        edited_sessions=edited_sessions(folder / SESSIONS, sessions),
         events=history.events(),
         models=models,
         checks=checks,
@@ -226,7 +226,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
         changed_models=tuple(
             name for name, sha256 in checked.items() if not is_unchanged(folder / MODELS / name, sha256)
         ),
-        incomplete=_incomplete(folder, sessions, checks),
+        measured_pose_text=_incomplete(folder, sessions, checks),
         controller=Controller.from_history(history),
         has_several_arms=is_cell_of_arms(folder),
     )

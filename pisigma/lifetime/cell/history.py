@@ -293,7 +293,7 @@ class History:
         Raises:
             OutputError: the history cannot be written.
         """
-        self.database.add(entries)
+        self.database.add_or_replace(entries)
 
     def add_session(self, session: SessionEntry, *also: Entry) -> bool:
         """Add a session and other entries unless another session in use has its content; return whether it did so.

@@ -52,23 +52,23 @@ class ModelInUse:
         self.findings.checked_warnings(cell)
         load(self.folder)
 
-    def check(self, retry: bool = False) -> None:
+    def check(self, retry_failed: bool = False) -> None:
         """Load the model in use if it has changed.
 
         Args:
-            retry: whether to also retry a model that could not be loaded before, and reload the same model if it was
-                changed.
+            retry_failed: whether to also retry a model that could not be loaded before, and reload the same model if it
+                was changed.
         """
         with self._lock:
             state = self._state()
-            if state is not None and state == self._seen and not retry:
+            if state is not None and state == self._seen and not retry_failed:
                 return
             is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
             try:
                 self.findings = self._find()
                 self._seen = state if is_settled else None  # without findings, the next check tries again
                 folder = model_folder(self.cell)
-                if retry or folder != self.folder:
+                if retry_failed or folder != self.folder:
                     self._load(folder)
                 self.folder, self.problem = folder, ""
             except (PisigmaError, OSError) as problem:

@@ -67,7 +67,7 @@ class CellStatus:
             "made_of": [] if model is None else list(model.made_of),
             "p95_mm": None if model is None else model.p95_mm,
             "limit_mm": facts.limit_mm,
-            "controller": export_records(facts.controller.active()),
+            "controller": export_records(facts.controller.active_exports()),
             "plans": list(facts.plans),
             "sessions": [
                 {
@@ -103,8 +103,8 @@ def status_of(folder: Path) -> CellStatus:
 def next_step(facts: CellFacts) -> Step:
     """Return the step of the first of `RULES` and `RULES_IN_USE` that applies; an open plan is measured first."""
     step = due_step(facts)
-    if facts.incomplete and step.verb in ("calibrate", "verify", "monitor"):
-        why = f"{facts.incomplete}; measure and import the others, or continue with `{step.command}`"
+    if facts.measured_pose_text and step.verb in ("calibrate", "verify", "monitor"):
+        why = f"{facts.measured_pose_text}; measure and import the others, or continue with `{step.command}`"
         return Step("session_incomplete", why, facts.import_command())
     if step.command != facts.command("plan"):
         return step
@@ -154,9 +154,9 @@ def _model_changed(facts: CellFacts) -> Step | None:
 
 
 def _edited_session(facts: CellFacts) -> Step | None:
-    if not facts.edited:
+    if not facts.edited_sessions:
         return None
-    name = facts.edited[0]
+    name = facts.edited_sessions[0]
     return Step(
         "edited_session",
         f"the file of session '{name}' was changed or removed after it was added; restore the measured file, or set "

@@ -234,7 +234,7 @@ class Displacement:
         number: number of every pose among all poses of the source, from 1.
         position: position of the tool in the robot's base frame under the first model [m].
         errors: distance [m] and angle [rad] between the poses of both models.
-        not_predicted: number of poses that are left out because a model does not predict them.
+        poses_not_predicted: number of poses that are left out because a model does not predict them.
     """
 
     source: str
@@ -242,7 +242,7 @@ class Displacement:
     number: Int64[Tensor, " poses"]
     position: Float64[Tensor, "poses 3"]
     errors: PoseErrors
-    not_predicted: int
+    poses_not_predicted: int
 
     @staticmethod
     def from_pair(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
@@ -285,7 +285,7 @@ class Displacement:
         return {
             "source": self.source,
             "poses": len(self.q),
-            "poses_not_predicted": self.not_predicted,
+            "poses_not_predicted": self.poses_not_predicted,
             **self.errors.figures.figures_by_name,
             "largest_at_pose": int(self.number[self.index_of_largest]),
             "largest_at_mm": (self.position[self.index_of_largest] * 1e3).tolist(),

@@ -116,11 +116,15 @@ class ParameterEffects:
         first = torch.where(self._alike, rank, 2 * len(rank)).amin(1) == rank
         self.tested = (first & self._observable).nonzero()[:, 0].tolist()
 
-    def parameters_with_same_effect(self, number: int) -> tuple[int, ...]:
+    def parameters_with_same_effect(self, parameter_index: int) -> tuple[int, ...]:
         """Return the other parameters with the same effect as a parameter."""
-        return tuple(other for other in self._alike[number].nonzero()[:, 0].tolist() if other != number)
+        return tuple(
+            other
+            for other in self._alike[parameter_index].nonzero()[:, 0].tolist()
+            if other != parameter_index
+        )
 
-    def shift(self, number: int, explained_parameters: Sequence[int]) -> tuple[float, float] | None:
+    def shift(self, parameter_index: int, explained_parameters: Sequence[int]) -> tuple[float, float] | None:
         """Estimate the shift of a parameter given others, and its standard deviation [m or rad].
 
         Returns:
@@ -128,10 +132,10 @@ class ParameterEffects:
             parameters.
         """
         left, observable = self._left(explained_parameters)
-        if not bool(observable[number]):
+        if not bool(observable[parameter_index]):
             return None
-        size = float(left[:, number].norm())
-        return float(left[:, number] @ self._y[:, 0]) / size**2, 1 / size
+        size = float(left[:, parameter_index].norm())
+        return float(left[:, parameter_index] @ self._y[:, 0]) / size**2, 1 / size
 
     def standard_scores(self, explained_parameters: Sequence[int]) -> Float64[Tensor, " parameters"]:
         """Compute the ratio of shift to standard deviation of every tested parameter given others; 0 if not tested."""

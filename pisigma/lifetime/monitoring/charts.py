@@ -46,7 +46,7 @@ class Chart:
     """Control chart of a quantity, which compares sessions with predictions from the model and earlier sessions.
 
     Attributes:
-        what: charted quantity, such as "joint 2" or "error".
+        quantity: charted quantity, such as "joint 2" or "error".
         unit: unit of the values.
         values: value in each session; NaN if the session does not determine it.
         sigmas: standard deviations of the values if nothing changes.
@@ -55,7 +55,7 @@ class Chart:
         one_sided: whether only an increase counts.
     """
 
-    what: str
+    quantity: str
     unit: ShownUnit
     values: Float64[Tensor, " sessions"]
     sigmas: Float64[Tensor, " sessions"]
@@ -128,7 +128,7 @@ class Chart:
             for name, those in values.items()
         }
         alarm = None if self.alarm is None else dates[self.alarm]
-        return {"what": self.what, **numbers, "limits": vars(self.limits), "alarm": alarm}
+        return {"what": self.quantity, **numbers, "limits": vars(self.limits), "alarm": alarm}
 
 
 def innovations(

@@ -231,12 +231,12 @@ class _Solved:
     @property
     def moved_frames(self) -> list[DriftGroup]:
         """Bases and tools that moved, which are free in the charts of joints and errors."""
-        return [_freed(one) for one in self.explanation.motions if is_frame(one.group.what)]
+        return [_freed(one) for one in self.explanation.motions if is_frame(one.group.name)]
 
     @property
     def frame_moved(self) -> bool:
         """Whether a base or a tool has moved too far for its motion to be linear."""
-        return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
+        return any(is_frame(one.group.name) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
         """Return the arm of the model, with moved bases and tools and given movements fitted."""
@@ -295,7 +295,7 @@ def _explained(
         V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
         return ExplainedRows(solved, there, explanation.log_evidence, V, factor * there.sigma(noise))
 
-    return mark_wrong_rows(explain(values.wrong_configurations), explain).what
+    return mark_wrong_rows(explain(values.wrong_configurations), explain).explanation
 
 
 def _sized(motion: GroupMotion) -> DriftGroup:
@@ -313,8 +313,8 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     rows = every.select((~wrong).nonzero()[:, 0])
     explanation, evidence = solved.explanation, solved.evidence
     motions = tuple(_sized(one) for one in solved.probable_movements)
-    of_arm = tuple(group for group in motions if not is_frame(group.what))
-    frames = tuple(group for group in motions if is_frame(group.what))
+    of_arm = tuple(group for group in motions if not is_frame(group.name))
+    frames = tuple(group for group in motions if is_frame(group.name))
     before = solved.arm_with(frames)
     (rms, angle), (rms_after, angle_after) = (_rms(arm, rows) for arm in (before, solved.arm_with(motions)))
     count = len(solved.values.y)
@@ -326,7 +326,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
         rows=every.rows,
         unchanged_probability=explanation.unchanged_probability,
         movements=_moved(solved, relocated),
-        candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
+        candidates=tuple((one.group.name, one.probability) for one in explanation.candidates),
         rms=rms,
         rms_after=rms_after * optimism,
         rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
@@ -349,7 +349,7 @@ def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement,
     found = [(_freed(one), one.probability) for one in explanation.motions]
     for (kind, name), probability in relocated.items():
         whats = (kind, f"{kind} {name}")
-        found += [(one, probability) for one in problem.groups if one.fixed_size and one.what in whats]
+        found += [(one, probability) for one in problem.groups if one.fixed_size and one.name in whats]
     if not found:
         return ()
     shift, covariance = solved.evidence.estimate_shift(
@@ -380,7 +380,7 @@ def _zeros(solved: _Solved) -> JointZeros:
 def _joints(solved: _Solved) -> list[DriftGroup]:
     """Return the groups of all joint zeros, with their prior set to `ZERO_PRIOR`."""
     groups = solved.problem.groups
-    return [replace(group, size=ZERO_PRIOR) for group in groups if group.what.startswith("joint ")]
+    return [replace(group, size=ZERO_PRIOR) for group in groups if group.name.startswith("joint ")]
 
 
 def format_probability(probability: float | None) -> str:

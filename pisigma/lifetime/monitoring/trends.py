@@ -32,14 +32,14 @@ class Trend:
     """Drift of a joint zero with time or temperature.
 
     Attributes:
-        what: quantity that drifts, such as "joint 2".
+        quantity: quantity that drifts, such as "joint 2".
         per: "month" or "kelvin".
         unit: unit of the change per month or kelvin.
         slope: change per month or kelvin [`unit`].
         sigma: standard deviation of the slope [`unit`].
     """
 
-    what: str
+    quantity: str
     per: Literal["month", "kelvin"]
     unit: ShownUnit
     slope: float
@@ -60,13 +60,13 @@ class Trend:
     def sentence(self) -> str:
         """Sentence that states the drift."""
         half = NORMAL_95 * self.sigma
-        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.per}"
+        return f"{self.quantity} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.per}"
 
     def to_json(self) -> dict[str, Any]:
         """Return slope and interval as plain values."""
         slope = {f"{self.unit}_per_{self.per}": self.slope}
         return {
-            "what": self.what,
+            "what": self.quantity,
             **slope,
             "interval": list(self.interval),
             "is_significant": self.is_significant,
@@ -78,7 +78,7 @@ class Jump:
     """Jump of a joint zero between two sessions, as after a collision, or deviation in a single session.
 
     Attributes:
-        what: quantity that jumped, such as "joint 2".
+        quantity: quantity that jumped, such as "joint 2".
         unit: unit of the jump.
         size: size of the jump [`unit`].
         sigma: standard deviation of the size [`unit`].
@@ -87,7 +87,7 @@ class Jump:
         is_single_session: whether only that session deviates.
     """
 
-    what: str
+    quantity: str
     unit: ShownUnit
     size: float
     sigma: float
@@ -100,13 +100,16 @@ class Jump:
         """Sentence that states the change."""
         half = NORMAL_95 * self.sigma
         if self.is_single_session:
-            return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
-        return f"{self.what} jumped by {self.size:.4f} ± {half:.4f} {self.unit} between {self.before} and {self.after}"
+            return (
+                f"{self.quantity} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
+            )
+        change = f"{self.size:.4f} ± {half:.4f} {self.unit}"
+        return f"{self.quantity} jumped by {change} between {self.before} and {self.after}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the jump and the dates around it as plain values."""
         return {
-            "what": self.what,
+            "what": self.quantity,
             f"size_{self.unit}": self.size,
             f"deviation_{self.unit}": self.sigma,
             "before": self.before,

@@ -200,8 +200,8 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
     """Return the groups with the sizes of groups that have the same names."""
-    sizes = {one.what: one.size for one in like}
-    return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
+    sizes = {one.name: one.size for one in like}
+    return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.name, 0.0)) for one in groups)
 
 
 def _searched(
@@ -218,4 +218,4 @@ def _searched(
         search.estimate_sizes()
         return ExplainedRows(search, there, search.log_evidence, search.covariance, search.sigma)
 
-    return mark_wrong_rows(explain(values.wrong_configurations), explain).what
+    return mark_wrong_rows(explain(values.wrong_configurations), explain).explanation

@@ -29,14 +29,14 @@ _MAX_ROWS = 60
 
 
 def find_motion(
-    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
+    model: CalibratedModel, rows: Measurements, fitted_kinds: Collection[FrameKind] = ()
 ) -> Session | None:
     """Find the joints, lengths, base or tool that have moved since a model was made; see `judge_session`.
 
     Args:
         model: the model.
         rows: rows; the model has their frames and targets, or these are fitted.
-        fitted: bases or tools that are known to have moved.
+        fitted_kinds: bases or tools that are known to have moved.
 
     Returns:
         The session without movements of fitted frames; None if the model stores no posterior, or if the rows do not
@@ -51,8 +51,10 @@ def find_motion(
             )
         some = posterior.with_model_names(some)
         with torch.no_grad():
-            session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)
-        moved = tuple(one for one in session.movements if one.what.split()[0] not in fitted)
+            session, _ = judge_session(
+                model, posterior, some, frame_keys(some, fitted_kinds) if fitted_kinds else None
+            )
+        moved = tuple(one for one in session.movements if one.what.split()[0] not in fitted_kinds)
         if not session_diagnostics(model, some, session):
             return replace(session, movements=moved)
     return None

@@ -104,9 +104,9 @@ SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(
 """Type of a movement that a model folder stores as `Movement.to_json`."""
 
 
-def is_frame(what: str) -> bool:
-    """Return whether `what` names a base or a tool."""
-    return what.split()[0] in ("base", "tool")
+def is_frame(moved_name: str) -> bool:
+    """Return whether something that moved is a base or a tool."""
+    return moved_name.split()[0] in ("base", "tool")
 
 
 def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
@@ -118,8 +118,8 @@ def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
     """
     moved: list[Movement] = []
     for number, group in enumerate(adaptation.drift.groups):
-        if group.size and group.what.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
-            estimate = adaptation.search.estimate_shift(number, with_prior=not group.what.startswith("joint"))
+        if group.size and group.name.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
+            estimate = adaptation.search.estimate_shift(number, with_prior=not group.name.startswith("joint"))
             moved += movements_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
     return tuple(one for one in moved if one.is_significant)
 
@@ -140,7 +140,7 @@ def movements_of_group(
         shift: shifts of the unknowns of the group [m or rad].
         covariance: their covariance [m or rad, squared].
     """
-    kind, _, name = group.what.partition(" ")
+    kind, _, name = group.name.partition(" ")
     if kind in ("base", "tool"):
         return _of_frame(problem, after, group, name, shift, covariance)
     space, moved = problem.design.problem.space, []
@@ -149,7 +149,7 @@ def movements_of_group(
         unit, factor = SHOWN_UNITS[parameter.unit]
         what, sign = parameter.name, 1
         if kind == "joint":
-            what, sign = group.what, int(space.robot.directions[int(name) - 1])
+            what, sign = group.name, int(space.robot.directions[int(name) - 1])
         moved.append(Movement(what, sign * float(by) * factor, float(variance) ** 0.5 * factor, unit))
     return moved
 
@@ -171,7 +171,7 @@ def _of_frame(
     of_members: Float64[Tensor, "members members"],
 ) -> list[Movement]:
     """Return the movements of a base or a tool: distance and angle."""
-    space, kind = problem.design.problem.space, group.what.split()[0]
+    space, kind = problem.design.problem.space, group.name.split()[0]
     before, after = (
         one.bases if kind == "base" else one.tools for one in (problem.posterior.geometry, geometry)
     )
@@ -190,7 +190,7 @@ def _of_frame(
                 motion.view(2, 3) @ problem.setup.reference_frames.bases[space.frames.index(name), :3, :3]
             ).flatten()
     return [
-        Movement(group.what, float(vector.norm()) * factor, sigma_along(vector, block) * factor, unit)
+        Movement(group.name, float(vector.norm()) * factor, sigma_along(vector, block) * factor, unit)
         for vector, block, (unit, factor) in (
             (motion[:3], covariance[:3, :3], SHOWN_UNITS["m"]),
             (motion[3:], covariance[3:, 3:], SHOWN_UNITS["rad"]),

@@ -326,7 +326,7 @@ def movement_hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]
     for group in problem.groups:
         if group.fixed_size:
             continue
-        if group.what not in ("lengths", "angles"):
+        if group.name not in ("lengths", "angles"):
             single.append(replace(group, log_prior_penalty=_MOVEMENT_PENALTY))
             continue
         for index, scale in zip(group.index, group.scale, strict=True):

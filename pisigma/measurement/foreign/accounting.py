@@ -82,7 +82,7 @@ def count_rows(
     )
 
 
-def sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
+def left_out_sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
     """Return sentences that list the rows that were left out, one sentence for every file and reason."""
     by_reason: dict[tuple[str, str], list[LeftOutRow]] = {}
     for row in left_out:

@@ -80,7 +80,7 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
     return T, given.dtype == np.float32, tensor
 
 
-def as_float_array(values: Any, what: str, throw: bool) -> Any:
+def as_float_array(values: Any, value_name: str, throw: bool) -> Any:
     """Return values as a contiguous float64 array, without a copy if possible.
 
     Values that are not numbers become NaN if `throw` is False.
@@ -94,22 +94,24 @@ def as_float_array(values: Any, what: str, throw: bool) -> Any:
         with suppress(ValueError):  # NumPy raises this for ragged values
             if not throw:
                 return np.full(np.shape(values), np.nan)
-        raise PoseError(expected=_METRES, option=what) from None
+        raise PoseError(expected=_METRES, option=value_name) from None
 
 
-def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, joints: Sequence[str]) -> Any:
+def joint_rows(
+    values: Any, batch: tuple[int, ...], value_name: str, throw: bool, joints: Sequence[str]
+) -> Any:
     """Return joint values or approach directions with the shape `(1 or poses, dof)`.
 
     Raises:
         PoseError: the shape does not match the joints or the poses, or the values are not numbers (`as_float_array`).
     """
-    rows, dof = as_float_array(values, what, throw), len(joints)
+    rows, dof = as_float_array(values, value_name, throw), len(joints)
     if rows.shape[-1:] != (dof,):
         raise PoseError(
             f"expected {dof} columns, got shape {rows.shape}",
             expected=f"{dof} columns",
             value=rows.shape,
-            option=what,
+            option=value_name,
             remedy=f"give a value for each of the joints {', '.join(joints)}, once or for every pose",
         )
     if rows.ndim == 1:
@@ -120,7 +122,7 @@ def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, join
         raise PoseError(
             expected=f"a batch shape that broadcasts to {batch} of the poses",
             value=rows.shape[:-1],
-            option=what,
+            option=value_name,
             remedy="give one row for each pose, or one for all",
         ) from None
 

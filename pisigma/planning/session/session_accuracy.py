@@ -97,25 +97,25 @@ def _calibrated(
 
 
 def with_cross_validation(
-    robot: Robot, so_far: SessionAccuracy, progress: Progress = lambda what: None
+    robot: Robot, accuracy_so_far: SessionAccuracy, progress: Progress = lambda what: None
 ) -> AccuracyPoint:
     """Return the accuracy with cross-validated errors, if the rows allow a cross-validation.
 
     Args:
         robot: nominal robot.
-        so_far: accuracy and posterior given the rows so far.
+        accuracy_so_far: accuracy and posterior given the rows so far.
         progress: callback that is called with the name of each step; an exception that it raises ends the computation.
     """
-    rows = so_far.rows
+    rows = accuracy_so_far.rows
     if rows is None:
-        return so_far.point
+        return accuracy_so_far.point
     try:
         folds = k_folds(rows, min(_FOLDS, rows.rows), seed=0)
         errors = validate(HybridCalibrator(robot), rows, folds, progress).models["hybrid"].position
     except (IdentificationError, MeasurementError):
-        return so_far.point
+        return accuracy_so_far.point
     rms, p95 = _rms_p95(errors)
-    return replace(so_far.point, cross_validated_rms=rms, cross_validated_p95=p95)
+    return replace(accuracy_so_far.point, cross_validated_rms=rms, cross_validated_p95=p95)
 
 
 def expected_accuracy(

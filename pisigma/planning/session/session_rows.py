@@ -212,7 +212,7 @@ class FurtherPoses:
         self,
         plan: StoredPlan,
         poses: int,
-        so_far: SessionAccuracy,
+        accuracy_so_far: SessionAccuracy,
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
     ) -> StoredPlan | None:
@@ -221,7 +221,7 @@ class FurtherPoses:
         Args:
             plan: the current plan.
             poses: total number of poses to calibrate with.
-            so_far: posterior and accuracy given the rows so far.
+            accuracy_so_far: posterior and accuracy given the rows so far.
             measured: joint values of the rows in use [rad or m].
             remaining: indices of the remaining poses, beginning with the next.
 
@@ -230,9 +230,9 @@ class FurtherPoses:
         """
         first = remaining[:1]
         check = remaining[1:][plan.check[remaining[1:]]]
-        count = poses - so_far.point.poses - int((~plan.check[first]).sum())
+        count = poses - accuracy_so_far.point.poses - int((~plan.check[first]).sum())
         new = self._new(plan, torch.cat([measured, plan.q[first]]))
-        posterior = so_far.posterior
+        posterior = accuracy_so_far.posterior
         if not len(first) or not 0 < count <= len(new):
             return None
         # The robot is already on its way to the next pose, which counts as measured unless it only tests the model.

@@ -211,22 +211,22 @@ class ArmInSurroundings:
         return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
 
     def blocked_lines_of_sight(
-        self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
+        self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], hidden_line: str
     ) -> dict[str, Bool[Tensor, " poses"]]:
         """Return the masks of the poses in which a line of sight is blocked, by blocking object.
 
         Args:
             q: joint values [rad or m].
             lines: both ends of the lines in the frame of the nominal base [m].
-            what: description of what would be hidden, such as "the reflector from the tracker".
+            hidden_line: description of what would be hidden, such as "the reflector from the tracker".
         """
-        return self._hidden(self.capsules.segments(q), lines, what)
+        return self._hidden(self.capsules.segments(q), lines, hidden_line)
 
     def _hidden(
         self,
         segments: Float64[Tensor, "poses pieces 2 3"],
         lines: Float64[Tensor, "poses lines 2 3"],
-        what: str,
+        hidden_line: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
         """Return the masks of the poses in which an obstacle is too near to a line of sight, by reason."""
         clearance = self.surroundings.clearance
@@ -235,10 +235,10 @@ class ArmInSurroundings:
             segment_distance(lines[:, :, None], segments[:, None, self.beam_blockers])
             - self.capsules.radius[self.beam_blockers]
         )
-        hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
+        hidden = {f"a link hides {hidden_line}": _least(distance.flatten(1), infinite) < clearance}
         for box in self.surroundings.boxes:
             distance = box_distance(box.to_box_frame(lines), box.half_size)
-            hidden[f"the box '{box.name}' hides {what}"] = distance.amin(1) < clearance
+            hidden[f"the box '{box.name}' hides {hidden_line}"] = distance.amin(1) < clearance
         return hidden
 
     def _turned_away(

@@ -46,7 +46,7 @@ class JointSection(Section):
             PlanningError: a joint's range is empty.
         """
         fields = ("limits_deg", "limits_mm")
-        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", axes=True)
+        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", by_axis_name=True)
         limits = robot.axis_limits
         for index, joint in enumerate(robot.axes):
             to_si = (

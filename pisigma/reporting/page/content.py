@@ -162,13 +162,13 @@ class ReportContent:
         targets: errors per target; empty if there is only one target.
         correlations: correlations of the parameters.
         curves: curves of the learned correction.
-        learned: sentences on the learned correction.
-        not_identified: sentences on parameters that the data cannot determine.
+        correction_sentences: sentences on the learned correction.
+        unidentified_parameters: sentences on parameters that the data cannot determine.
         advice: sentences that recommend further measurements.
         provenance: names and values.
         joints: errors of the joints of a network; empty for other models.
-        missing: sentences on figures that the report cannot state, with the reasons.
-        missing_parameters: sentences on figures of parameters that the folder does not store.
+        missing_figures: sentences on figures that the report cannot state, with the reasons.
+        missing_parameter_figures: sentences on figures of parameters that the folder does not store.
         correlation_png: figure in the folder, if the folder does not store the correlations as numbers.
         images: the nominal and the calibrated arm in images; None without images.
     """
@@ -186,13 +186,13 @@ class ReportContent:
     targets: ErrorsByFrameOrTarget
     correlations: ParameterCorrelations
     curves: tuple[CorrectionCurve, ...]
-    learned: tuple[str, ...]
-    not_identified: tuple[str, ...]
+    correction_sentences: tuple[str, ...]
+    unidentified_parameters: tuple[str, ...]
     advice: tuple[str, ...]
     provenance: tuple[tuple[str, str], ...]
     joints: tuple[JudgedJoint, ...]
-    missing: tuple[str, ...]
-    missing_parameters: tuple[str, ...]
+    missing_figures: tuple[str, ...]
+    missing_parameter_figures: tuple[str, ...]
     correlation_png: bytes = b""
     images: ArmInImages | None = None
 
@@ -227,11 +227,11 @@ class ReportContent:
             ],
             "frames": [asdict(one) for one in self.frames.name_errors],
             "targets": [asdict(one) for one in self.targets.name_errors],
-            "not_identified": list(self.not_identified),
+            "not_identified": list(self.unidentified_parameters),
             "observability": {} if self.summary is None else asdict(self.summary.observability),
             "correlated": [list(pair) for pair in self.correlations.pairs],
             "advice": list(self.advice),
-            "limitations": list(self.missing),
+            "limitations": list(self.missing_figures),
             "provenance": dict(self.provenance),
         }
         if self.images is not None:
@@ -290,13 +290,15 @@ def report_content(
         else group_errors_by_name(rows, rows.measurements.target),
         correlations=correlations,
         curves=correction_curves(model),
-        learned=_learned(summary),
-        not_identified=() if summary is None else (*undetermined_lines(summary), *warning_lines(summary)),
+        correction_sentences=_learned(summary),
+        unidentified_parameters=()
+        if summary is None
+        else (*undetermined_lines(summary), *warning_lines(summary)),
         advice=advice_for(model, summary, rows, figures, limit, causes),
         provenance=_provenance(model, rows),
         joints=joints,
-        missing=say("missing", rows, model),
-        missing_parameters=_missing_parameters(model, summary, correlations),
+        missing_figures=say("missing", rows, model),
+        missing_parameter_figures=_missing_parameters(model, summary, correlations),
         correlation_png=_correlation_png(folder),
         images=images,
     )

@@ -85,7 +85,7 @@ def monitoring_page(
 
 def _marks_of(marks: Mapping[str, Sequence[Mark]], chart: Chart) -> list[Mark]:
     """Return the marks of a chart, including marks for all charts."""
-    return [*marks.get("", ()), *marks.get(chart.what, ())]
+    return [*marks.get("", ()), *marks.get(chart.quantity, ())]
 
 
 def _sessions(records: Sequence[Record], refused: Sequence[tuple[str, str, str]]) -> Table:
@@ -156,13 +156,13 @@ def draw_values(
         _mark(axes, marks, days)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
-        quantity = "RMS error" if chart.one_sided else f"shift of {chart.what}"
+        quantity = "RMS error" if chart.one_sided else f"shift of {chart.quantity}"
         axes.set(ylabel=f"{quantity} [{chart.unit}]")
         _dates(axes)
     last = "unobservable" if np.isnan(values[-1]) else f"{values[-1]:z.4f} {chart.unit}"
     of = "with 95 % intervals" if chart.one_sided else "with the 95 % limits of an unchanged robot"
     alt = f"{_sentence(quantity)} in {len(days)} sessions, {of}; the last is {last}."
-    return Drawing(f"{_key(chart)}_values", chart.what, alt, figure)
+    return Drawing(f"{_key(chart)}_values", chart.quantity, alt, figure)
 
 
 def _mark(axes: Axes, marks: Sequence[Mark], days: Sequence[datetime.date]) -> None:
@@ -196,14 +196,12 @@ def draw_statistics(chart: Chart, days: Sequence[datetime.date], marks: Sequence
         axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
         _dates(axes)
     largest = float(np.maximum(chart.ewma_of_limit.numpy()[-1], chart.cusum_of_limit.numpy()[-1]))
-    alt = (
-        f"EWMA and CUSUM of {chart.what} over their limits; the larger is {largest:.2f} at the last session."
-    )
-    return Drawing(f"{_key(chart)}_statistics", chart.what, alt, figure)
+    alt = f"EWMA and CUSUM of {chart.quantity} over their limits; the larger is {largest:.2f} at the last session."
+    return Drawing(f"{_key(chart)}_statistics", chart.quantity, alt, figure)
 
 
 def _key(chart: Chart) -> str:
-    return chart.what.replace(" ", "_")
+    return chart.quantity.replace(" ", "_")
 
 
 def _dates(axes: Axes) -> None:

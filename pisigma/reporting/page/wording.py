@@ -8,7 +8,7 @@ import torch
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.calibration_tables import cross_validation_text, warning_lines
-from pisigma.reporting.rendering import sentences
+from pisigma.reporting.rendering import render_sentences
 from pisigma.reporting.result_text import Table
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.judged_rows import JudgedRows
@@ -48,7 +48,7 @@ LAYER_LABELS: dict[Quantity, str] = {
 }
 """Labels of the values that an error map shows, by layer."""
 
-say = functools.partial(sentences, "report.txt.j2")
+say = functools.partial(render_sentences, "report.txt.j2")
 """Fill in a macro of `report.txt.j2`; see `sentences`."""
 
 
@@ -98,7 +98,7 @@ def zeros_table(arm: ArmInImages) -> Table:
 def arm_sentence(arm: ArmInImages) -> str:
     """Return a sentence on the errors of both arms in the images."""
     before, after = arm.nominal_rms * 1e3, arm.calibrated_rms * 1e3
-    times = f"{before / after:.1f} times smaller: it is halved {arm.halvings:.1f} times"
+    times = f"{before / after:.1f} times smaller: it is halved {arm.error_halvings:.1f} times"
     change = times if after < before else "not smaller"
     fitted = (
         "these images" if arm.training_images == len(arm.images) else f"{arm.training_images} of these images"

@@ -143,7 +143,7 @@ def stated_joints(
     for_prismatic: Mapping[str, Value],
     field_names: tuple[str, str],
     place_in_recipe: str,
-    axes: bool = False,
+    by_axis_name: bool = False,
 ) -> dict[int, Value]:
     """Return the values of two mappings in a recipe by joint index.
 
@@ -153,13 +153,13 @@ def stated_joints(
         for_prismatic: values of prismatic joints, by name.
         field_names: keys of the two mappings in the recipe, revolute first.
         place_in_recipe: position in the recipe, for messages.
-        axes: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
+        by_axis_name: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
 
     Raises:
         RecipeError: a joint is unknown, or is in the mapping for the other joint type.
     """
     values: dict[int, Value] = {}
-    joints = robot.axes if axes else robot.joints
+    joints = robot.axes if by_axis_name else robot.joints
     kinds = ((for_revolute, *field_names, "revolute"), (for_prismatic, *field_names[::-1], "prismatic"))
     for mapping, field, other, kind in kinds:
         for name, value in mapping.items():

@@ -116,14 +116,14 @@ class RowsUnderModel:
     Attributes:
         model: the model.
         rows: the rows.
-        fitted: frames and tools that are known to have moved and are therefore fitted to the rows.
+        fitted_kinds: frames and tools that are known to have moved and are therefore fitted to the rows.
         allowed_moves: what else may have moved without this being a fault, such as "joint_zero".
         nominal: the nominal robot with base and tool fitted; used only to report its errors after a correction.
     """
 
     model: CalibratedModel
     rows: Measurements
-    fitted: tuple[FrameKind, ...]
+    fitted_kinds: tuple[FrameKind, ...]
     allowed_moves: frozenset[Move]
     nominal: CalibratedModel | None = None
 
@@ -131,7 +131,7 @@ class RowsUnderModel:
     def from_rows(
         model: CalibratedModel,
         rows: Measurements,
-        fitted: Collection[FrameKind],
+        fitted_kinds: Collection[FrameKind],
         allowed_moves: Collection[Move],
         nominal: CalibratedModel | None = None,
     ) -> "RowsUnderModel | None":
@@ -141,7 +141,7 @@ class RowsUnderModel:
         """
         if rows.position is None:
             return None
-        kinds = kinds_to_fit(model, rows, fitted)
+        kinds = kinds_to_fit(model, rows, fitted_kinds)
         some = without_unknown_orientation(model, rows)
         T = poses_of_rows(model, with_known_names(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
@@ -153,7 +153,7 @@ class RowsUnderModel:
     @cached_property
     def renamed_rows(self) -> Measurements:
         """The rows, with the names of fitted frames and targets replaced by names of the model."""
-        return with_known_names(self.model, self.rows, self.fitted)
+        return with_known_names(self.model, self.rows, self.fitted_kinds)
 
     @cached_property
     def poses_before_fit(self) -> Float64[Tensor, "rows 4 4"]:
@@ -175,8 +175,8 @@ class RowsUnderModel:
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
         """Predicted poses, with fitted frames and tools."""
         return (
-            fit_frames(self.poses_before_fit, self.measured, self.rows, self.fitted)[0]
-            if self.fitted
+            fit_frames(self.poses_before_fit, self.measured, self.rows, self.fitted_kinds)[0]
+            if self.fitted_kinds
             else self.poses_before_fit
         )
 
@@ -218,12 +218,12 @@ class RowsUnderModel:
     @cached_property
     def setup_faults(self) -> tuple[SetupFault, ...]:
         """Setup faults of any size that explain the errors of all rows."""
-        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted)
+        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted_kinds)
 
     @cached_property
     def moved_frames(self) -> tuple[SetupFault, ...]:
         """Motions of frames and tools of any size that explain the errors."""
-        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted, frames_only=True)
+        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted_kinds, frames_only=True)
 
     def is_allowed_motion(self, fault: SetupFault) -> bool:
         """Return whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
@@ -239,14 +239,14 @@ RowCheck = Callable[[RowsUnderModel], Iterator[Diagnostic]]
 
 
 def kinds_to_fit(
-    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
+    model: CalibratedModel, rows: Measurements, fitted_kinds: Collection[FrameKind]
 ) -> tuple[FrameKind, ...]:
     """Return what is fitted, including frames or tools if the rows have some that the model lacks."""
     new: tuple[FrameKind, ...] = (
         *(("base",) if _unknown(rows.frame, model.bases) else ()),
         *(("tool",) if _unknown(rows.target, model.tools) else ()),
     )
-    return tuple(dict.fromkeys((*fitted, *new)))
+    return tuple(dict.fromkeys((*fitted_kinds, *new)))
 
 
 def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:

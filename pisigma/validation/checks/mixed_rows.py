@@ -91,7 +91,7 @@ def too_many_wrong_rows_diagnostic(rows: Measurements, wrong_rows: Bool[Tensor, 
 
 def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
     """Return a sentence about the cause that explains the wrong rows; empty if no cause does."""
-    faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
+    faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted_kinds)
     if not faults:
         return ""
     fault = combine_alternatives(faults)
@@ -101,7 +101,7 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
 
 def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]:
     """Yield the predicted poses, and those with a base or a tool that agrees with as many rows as possible."""
-    if not judged.fitted:
+    if not judged.fitted_kinds:
         yield judged.poses_before_fit
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
         return

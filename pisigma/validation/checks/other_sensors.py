@@ -61,7 +61,7 @@ def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> 
 def diagnose_lengths(
     model: CalibratedModel,
     rows: Measurements,
-    fitted: Collection[FrameKind],
+    fitted_kinds: Collection[FrameKind],
     allowed_moves: Collection[Move],
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
     """Report the causes of errors that are too large for wear, in rows without positions.
@@ -73,13 +73,13 @@ def diagnose_lengths(
         model: the model.
         rows: rows without positions. Rows of an anchor with too few rows are not checked; touches and wires to
             stated points are not checked if the base may have moved, because they depend on the base.
-        fitted: frames and tools that are known to have moved.
+        fitted_kinds: frames and tools that are known to have moved.
         allowed_moves: what else may have moved without this being a fault.
 
     Returns:
         The findings that make the rows implausible, and the setup fault that explains them, which may be a motion.
     """
-    kinds = kinds_to_fit(model, rows, fitted)
+    kinds = kinds_to_fit(model, rows, fitted_kinds)
     free = {"tool"} & {*kinds}
     moves = free | ({*allowed_moves} - {"frame"})
     if ("base" in kinds or "frame" in allowed_moves) and (

@@ -32,7 +32,7 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     ):
         if sensor.sigma is None or sensor.is_stated or sensor.components not in _CHI_MEDIAN:
             continue
-        distance = part.distance[sensor.present]
+        distance = part.residual_length[sensor.present]
         ratio = float(distance.median()) / _CHI_MEDIAN[sensor.components]
         margin = math.exp(3 / math.sqrt(len(distance)))
         larger = ratio if learned is None else learned.noise[sensor.name]

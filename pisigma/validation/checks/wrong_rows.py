@@ -48,16 +48,16 @@ class FilteredRows:
 
 
 def without_wrong_rows(
-    models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
+    models: Iterable[CalibratedModel], rows: Measurements, fitted_kinds: Collection[FrameKind] = ()
 ) -> FilteredRows:
     """Leave out single rows that deviate too much from every model to have been measured correctly.
 
     Args:
         models: models with which the rows are compared.
         rows: the rows.
-        fitted: frames and tools that are fitted to the rows.
+        fitted_kinds: frames and tools that are fitted to the rows.
     """
-    found = [_far_rows(model, rows, fitted) for model in models]
+    found = [_far_rows(model, rows, fitted_kinds) for model in models]
     if not found or any(one is None for one in found):
         return FilteredRows(rows)
     numbers = sorted(set.intersection(*(set(one) for one in found if one is not None)))
@@ -79,19 +79,21 @@ def without_wrong_rows(
 
 
 def _far_rows(
-    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
+    model: CalibratedModel, rows: Measurements, fitted_kinds: Collection[FrameKind]
 ) -> dict[int, str] | None:
     """Return the rows that are far off, with texts of their errors; None if the model cannot predict the rows."""
     if rows.position is None:
         return _far_lengths(model, rows)
     there = torch.isfinite(rows.position).all(-1)
-    if int(there.sum()) < (_MIN_ROWS_TO_FIT if fitted else _MIN_ROWS):
+    if int(there.sum()) < (_MIN_ROWS_TO_FIT if fitted_kinds else _MIN_ROWS):
         return None
     numbers = there.nonzero()[:, 0]
-    judged = RowsUnderModel.from_rows(model, rows.select(numbers), fitted, ())
+    judged = RowsUnderModel.from_rows(model, rows.select(numbers), fitted_kinds, ())
     if judged is None or judged.rows.rows != len(numbers):
         return None
-    far, texts = _far(judged, _fitted_to_usual_rows(judged) if judged.fitted else judged.poses_before_fit)
+    far, texts = _far(
+        judged, _fitted_to_usual_rows(judged) if judged.fitted_kinds else judged.poses_before_fit
+    )
     return {int(numbers[row]): texts[row] for row in far.nonzero()[:, 0].tolist()}
 
 
@@ -127,7 +129,7 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
             position=torch.where(suspicious[:, None], T[:, :3, 3], judged.measured.position),
             rotation=torch.where(suspicious[:, None, None], T[:, :3, :3], judged.measured.rotation),
         )
-        T = fit_frames(judged.poses_before_fit, usual, judged.rows, judged.fitted)[0]
+        T = fit_frames(judged.poses_before_fit, usual, judged.rows, judged.fitted_kinds)[0]
     return T
 
 

@@ -167,7 +167,7 @@ def frame_summary(
     result = fit.solved.result()
     lengths, angles = _rms(fit, "m"), _rms(fit, "rad")
     summary = FrameSummary(
-        only=fit.only,
+        only=fit.frame_choice,
         rows=fit.rows.rows,
         coordinates=coordinate_figures(fit, arm_variance),
         weak_directions=weak_direction_sentences(fit),

@@ -46,8 +46,8 @@ class JudgedRows:
         is_inside_range: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.
         repeated_row_warnings: warnings about duplicate rows and training rows of the model.
-        nominal: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model that was not
-            calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
+        nominal_frame_origin: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model
+            that was not calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
         rows_without_error: number of rows without a position error.
         repeats: number of repeats of the cross-validation; the errors are those of the first one.
     """
@@ -62,7 +62,7 @@ class JudgedRows:
     is_inside_range: Bool[Tensor, " rows"]
     left_out: int = 0
     repeated_row_warnings: tuple[str, ...] = ()
-    nominal: Literal["fitted", "given", "model"] | None = None
+    nominal_frame_origin: Literal["fitted", "given", "model"] | None = None
     rows_without_error: int = 0
     repeats: int = 1
 
@@ -138,7 +138,7 @@ def rows_of_file(
         _judged(model, rows, models, residual, (origin, origin)),
         left_out=left_out,
         repeated_row_warnings=(*copy_warnings(rows.left_out), *again),
-        nominal="model" if not own_frames else "given" if model.calibrated is None else "fitted",
+        nominal_frame_origin="model" if not own_frames else "given" if model.calibrated is None else "fitted",
         rows_without_error=int((~torch.isfinite(errors.position)).sum()),
     )
 

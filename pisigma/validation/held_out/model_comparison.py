@@ -132,8 +132,9 @@ class QuantityErrors:
         intervals: confidence intervals of "mean", "rms" and "p95"; None if there is only one configuration.
         axes: by axis of the frame, "mean" of the signed errors and "rms", "p95", "max" of their sizes; empty if some
             rows have lengths instead of positions.
-        inside: `statistics` of the rows inside the model's domain; empty if there are none or the model has no domain.
-        outside: the same for the rows outside it.
+        inside_statistics: `statistics` of the rows inside the model's domain; empty if there are none or the model has
+            no domain.
+        outside_statistics: the same for the rows outside it.
         difference: difference from the first model; None for the first model.
     """
 
@@ -141,8 +142,8 @@ class QuantityErrors:
     statistics: Mapping[str, float]
     intervals: Mapping[str, Interval | None]
     axes: Mapping[str, Mapping[str, float]]
-    inside: Mapping[str, float]
-    outside: Mapping[str, float]
+    inside_statistics: Mapping[str, float]
+    outside_statistics: Mapping[str, float]
     difference: Difference | None
 
 
@@ -239,7 +240,7 @@ def compare_models(
     models: Mapping[str, CalibratedModel],
     measurements: Measurements,
     bootstrap: Bootstrap | None = None,
-    fitted: Collection[FrameKind] = (),
+    fitted_kinds: Collection[FrameKind] = (),
     socket_distances: Mapping[PairOfSockets, float] = MappingProxyType({}),
 ) -> ModelComparison:
     """Compare models on measurements, using only rows that all models predict.
@@ -248,7 +249,7 @@ def compare_models(
         models: one or more models by name.
         measurements: the rows, in the frames in which the models were fitted.
         bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
-        fitted: frames or targets that are fitted to the rows for every model; see `errors_in_fitted_frames`.
+        fitted_kinds: frames or targets that are fitted to the rows for every model; see `errors_in_fitted_frames`.
         socket_distances: stated distances between sockets of the rows [m].
 
     Raises:
@@ -257,7 +258,9 @@ def compare_models(
         PoseError: the joint values do not fit a model's robot.
     """
     bootstrap = bootstrap or Bootstrap()
-    vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
+    vectors = {
+        name: errors_in_fitted_frames(model, measurements, fitted_kinds) for name, model in models.items()
+    }
     measured, others = has_position(measurements), rows_with_only_length(measurements)
     if not bool((measured | others).any()):
         raise MeasurementError(
@@ -355,8 +358,8 @@ def _quantity(
                 statistics=error_statistics(errors.norm(dim=-1)),
                 intervals=_by_name(intervals.value[:, number]),
                 axes={axis: axis_statistics(along) for axis, along in zip("xyz", errors.T, strict=True)},
-                inside=_some(errors, within),
-                outside=_some(errors, None if within is None else ~within),
+                inside_statistics=_some(errors, within),
+                outside_statistics=_some(errors, None if within is None else ~within),
                 difference=differences[number] if number else None,
             )
         )

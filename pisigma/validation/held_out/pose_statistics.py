@@ -169,12 +169,12 @@ class Comparison:
     Attributes:
         nominal: errors without the correction (base and tool as fitted).
         corrected: errors with it; NaN in the same rows.
-        not_predicted: number of rows that are left out of both because the model has no prediction for them.
+        rows_not_predicted: number of rows that are left out of both because the model has no prediction for them.
     """
 
     nominal: PoseErrors
     corrected: PoseErrors
-    not_predicted: int
+    rows_not_predicted: int
 
     @staticmethod
     def from_errors(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":

@@ -176,7 +176,7 @@ class ComparisonFigures(Section):
         """Compute the figures of a comparison, with numbers of folds or rows."""
         return ComparisonFigures(
             **counts,
-            rows_not_predicted=comparison.not_predicted,
+            rows_not_predicted=comparison.rows_not_predicted,
             nominal=comparison.nominal.figures,
             corrected=comparison.corrected.figures,
         )

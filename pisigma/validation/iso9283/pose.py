@@ -151,12 +151,12 @@ def barycentre(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3
     return first[..., 0, :] + (attained - first).mean(-2)
 
 
-def check_repeats(attained: Float[Tensor, "*batch n 3"], repeated: str) -> None:
+def check_repeats(attained: Float[Tensor, "*batch n 3"], repeated_item: str) -> None:
     """Refuse a single repeat, which has no spread.
 
     Args:
         attained: values of the n repeats.
-        repeated: what was repeated, such as "a command".
+        repeated_item: what was repeated, such as "a command".
 
     Raises:
         MeasurementError: there is only one repeat.
@@ -164,7 +164,7 @@ def check_repeats(attained: Float[Tensor, "*batch n 3"], repeated: str) -> None:
     if attained.shape[-2] < 2:
         raise MeasurementError(
             option="attained",
-            expected=f"2 or more repeats of {repeated}",
+            expected=f"2 or more repeats of {repeated_item}",
             value=attained.shape[-2],
             remedy="measure 30, as the standard requires",
         )

@@ -105,7 +105,7 @@ class ArmInImages:
         return float(np.sqrt(np.mean([one.calibrated_error**2 for one in self.images])))
 
     @property
-    def halvings(self) -> float:
+    def error_halvings(self) -> float:
         """Number of times that the error is halved, `log2(nominal / calibrated)`."""
         return math.log2(self.nominal_rms / self.calibrated_rms)
 
@@ -114,7 +114,7 @@ class ArmInImages:
         return {
             "nominal_rms_mm": self.nominal_rms * 1e3,
             "calibrated_rms_mm": self.calibrated_rms * 1e3,
-            "halvings": self.halvings,
+            "halvings": self.error_halvings,
             "training_images": self.training_images,
             "images": [
                 {

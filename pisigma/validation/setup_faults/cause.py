@@ -20,8 +20,8 @@ class Cause:
         amount: displacement of a frame or tool [m]; for a wrong unit, the ratio of correct to stated values; the number
             of corrections applied in addition to those logged (1 or -1); or the number of targets with the same name.
             NaN for faults of other kinds.
-        columns: for every joint, the number (from 1) of the logged column with its values, negative for a reversed
-            sign; empty for faults other than "joint_order" and "joint_sign".
+        signed_column_of_joint: for every joint, the number (from 1) of the logged column with its values, negative for
+            a reversed sign; empty for faults other than "joint_order" and "joint_sign".
     """
 
     kind: str
@@ -31,7 +31,7 @@ class Cause:
     joints: tuple[int, ...] = ()
     largest_zero_shift: float = math.inf
     amount: float = math.nan
-    columns: tuple[int, ...] = ()
+    signed_column_of_joint: tuple[int, ...] = ()
 
 
 def joints_text(joints: tuple[int, ...]) -> str:

@@ -165,16 +165,20 @@ def joint_causes(maps: JointMaps, map_index: int, robot: Robot) -> tuple[Cause, 
     advice = "check the order of the joint columns"
     if len(moved) == 2:
         clause = f"the columns of {joints_text(moved)} are swapped"
-        causes.append(Cause("joint_order", clause, advice, 1.0, moved, columns=columns))
+        causes.append(Cause("joint_order", clause, advice, 1.0, moved, signed_column_of_joint=columns))
     elif moved:
         logged = ", ".join(f"q{column + 1}" for column in order)
         clause = f"the joint columns are in another order (joints 1 to {robot.dof} are in {logged})"
-        causes.append(Cause("joint_order", clause, advice, 2.0, moved, columns=columns))
+        causes.append(Cause("joint_order", clause, advice, 2.0, moved, signed_column_of_joint=columns))
     if negative := tuple(i for i, value in enumerate(factor) if value < 0):
         signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"
         clause = signs.format(joints_text(negative))
         advice = "check the directions of the joints"
-        causes.append(Cause("joint_sign", clause, advice, float(len(negative)), negative, columns=columns))
+        causes.append(
+            Cause(
+                "joint_sign", clause, advice, float(len(negative)), negative, signed_column_of_joint=columns
+            )
+        )
     causes.extend(_unit_causes(factor, robot))
     if zeros := tuple(i for i, value in enumerate(offset) if value):
         causes.append(_zero_cause(zeros, offset, robot))

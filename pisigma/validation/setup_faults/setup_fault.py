@@ -28,7 +28,7 @@ class SetupFault:
         largest_zero_shift: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         joints: indices of the joints concerned, from 0.
         amounts: amount of every cause, see `Cause.amount`.
-        columns: columns with the values of every joint, see `Cause.columns`.
+        signed_column_of_joint: columns with the values of every joint, see `Cause.signed_column_of_joint`.
     """
 
     kinds: tuple[str, ...]
@@ -42,7 +42,7 @@ class SetupFault:
     largest_zero_shift: float = math.inf
     joints: tuple[int, ...] = ()
     amounts: tuple[float, ...] = ()
-    columns: tuple[int, ...] = ()
+    signed_column_of_joint: tuple[int, ...] = ()
 
     @property
     def explains_orientation(self) -> bool:
@@ -86,7 +86,7 @@ class SetupFault:
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
             finite["ratio"] = self.amounts[0]
-        columns = {"columns": self.columns} if self.columns else {}
+        columns = {"columns": self.signed_column_of_joint} if self.signed_column_of_joint else {}
         return {**finite, "joints": tuple(joint + 1 for joint in self.joints), **columns}
 
     def to_json(self) -> dict[str, object]:
@@ -110,7 +110,14 @@ def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
     advice = dict.fromkeys(fault.advice for fault in faults)
     moved = max(fault.largest_zero_shift for fault in faults)
     clause, advised = ", or ".join(clauses), "; ".join(advice)
-    return replace(faults[0], clause=clause, advice=advised, largest_zero_shift=moved, amounts=(), columns=())
+    return replace(
+        faults[0],
+        clause=clause,
+        advice=advised,
+        largest_zero_shift=moved,
+        amounts=(),
+        signed_column_of_joint=(),
+    )
 
 
 def fault_of_cause(cause: Cause, rms_before: float, rms_after: float) -> SetupFault:
@@ -119,7 +126,7 @@ def fault_of_cause(cause: Cause, rms_before: float, rms_after: float) -> SetupFa
     return SetupFault(
         *((cause.kind,), cause.clause, cause.advice, rms_before, rms_after, nan, nan, nan),
         joints=cause.joints,
-        columns=cause.columns,
+        signed_column_of_joint=cause.signed_column_of_joint,
     )
 
 
@@ -138,5 +145,7 @@ def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, nominal_rms_
         largest_zero_shift=max(cause.largest_zero_shift for cause in other.causes),
         joints=tuple(joint for cause in other.causes for joint in cause.joints),
         amounts=tuple(cause.amount for cause in other.causes),
-        columns=next((cause.columns for cause in other.causes if cause.columns), ()),
+        signed_column_of_joint=next(
+            (cause.signed_column_of_joint for cause in other.causes if cause.signed_column_of_joint), ()
+        ),
     )

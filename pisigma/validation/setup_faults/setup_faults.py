@@ -40,7 +40,7 @@ def find_setup_faults(
     model: CalibratedModel,
     nominal: CalibratedModel | None,
     measurements: Measurements,
-    fitted: Collection[FrameKind] = (),
+    fitted_kinds: Collection[FrameKind] = (),
     frames_only: bool = False,
 ) -> tuple[SetupFault, ...]:
     """Find setup faults that reduce the errors of a model to a quarter or less, simplest first.
@@ -58,7 +58,7 @@ def find_setup_faults(
         nominal: the nominal robot with base and tool fitted, to report its errors after the correction; None to omit
             them.
         measurements: rows with positions in frames and of targets of the model; joint limits are not considered.
-        fitted: frames or targets that are fitted to the rows; any name is allowed, and a motion is not a fault.
+        fitted_kinds: frames or targets that are fitted to the rows; any name is allowed, and a motion is not a fault.
         frames_only: whether to try only motions of frames and tools.
 
     Returns:
@@ -66,7 +66,7 @@ def find_setup_faults(
     """
     judged = without_unknown_orientation(model, measurements)
     some = judged.select(evenly_spaced_rows(measured_rows(judged), MAX_ROWS))
-    known = with_known_names(model, some, fitted)
+    known = with_known_names(model, some, fitted_kinds)
     T = poses_of_rows(model, known)
     predicted = torch.isfinite(T).flatten(1).all(-1)
     if not bool(predicted.any()):
@@ -74,8 +74,8 @@ def find_setup_faults(
     some, known, T = some.select(predicted), known.select(predicted), T[predicted]
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * model.robot.reach)
     here = Hypothesis(some.q, T, measured)
-    if fitted:
-        T, columns = fit_frames(T, measured, some, fitted)
+    if fitted_kinds:
+        T, columns = fit_frames(T, measured, some, fitted_kinds)
         here = replace(here, T=T, fitted_parameters=columns.shape[-1])
     if not here.error > NOTICED:
         return ()
@@ -86,14 +86,14 @@ def find_setup_faults(
         if frames_only
         else fault_hypotheses(arm, known, here, most)
     )
-    free = {_CAUSES[kind] for kind in fitted}
+    free = {_CAUSES[kind] for kind in fitted_kinds}
     faults = tuple(
         fault_from_hypothesis(here, other.without_causes(free), _nominal_error(nominal, known, other))
         for other in choose_simplest(list(tried), most)
         if not {cause.kind for cause in other.causes} <= free
     )
     if not faults and not frames_only:
-        faults = find_nominal_robot_faults(model.robot, with_known_names(model, judged, fitted))
+        faults = find_nominal_robot_faults(model.robot, with_known_names(model, judged, fitted_kinds))
     return faults
 
 

@@ -47,11 +47,11 @@ class UncertaintyBudget:
 
     Attributes:
         components: components whose figures come from data or from a stated setting.
-        missing: components that are not stated and do not contribute, one sentence each.
+        missing_components: components that are not stated and do not contribute, one sentence each.
     """
 
     components: tuple[Component, ...]
-    missing: tuple[str, ...] = ()
+    missing_components: tuple[str, ...] = ()
 
     @property
     def combined_uncertainty(self) -> float:
@@ -96,7 +96,7 @@ class UncertaintyBudget:
         """Return plain values with lengths in mm; without components there are no combined figures."""
         plain: dict[str, Any] = {
             "components": [one.to_json() for one in self.components],
-            "not_stated": list(self.missing),
+            "not_stated": list(self.missing_components),
         }
         if not self.components:
             return plain

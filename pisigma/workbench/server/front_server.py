@@ -154,17 +154,17 @@ class Access:
     Attributes:
         token: secret in the link.
         cookie: secret in the cookie.
-        folder: random name of the folder of all pages.
+        random_folder: random name of the folder of all pages.
     """
 
     token: str = field(default_factory=_random_name)
     cookie: str = field(default_factory=_random_name)
-    folder: str = field(default_factory=_random_name)
+    random_folder: str = field(default_factory=_random_name)
 
     @property
     def root(self) -> str:
         """Path of the folder, without a slash at its end."""
-        return f"/{self.folder}"
+        return f"/{self.random_folder}"
 
     async def open_link(self, request: web.Request) -> web.Response:
         """Answer the link: set the cookie, and forward the browser to the first page.

@@ -78,8 +78,8 @@ def acceptance_of(cell: Cell) -> Acceptance:
         budget=budget,
         measured=measured,
         repeats=repeats,
-        accepted=tuple(one for one in cell.history.events() if one.kind == "accepted"),
-        missing=missing_statements(instrument, document.pose_repeatability_mm, problem, repeats),
+        acceptance_events=tuple(one for one in cell.history.events() if one.kind == "accepted"),
+        missing_statements=missing_statements(instrument, document.pose_repeatability_mm, problem, repeats),
     )
 
 

@@ -12,7 +12,7 @@ _MAX_NAMES = 10_000
 """Largest number of files with the same date in a folder."""
 
 
-def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
+def free_path(folder: Path, name: str, suffix: str, taken_names: Collection[str] = ()) -> Path:
     """Return a path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
 
     Raises:
@@ -21,25 +21,25 @@ def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ())
     for number in range(1, _MAX_NAMES):
         stem = name if number == 1 else f"{name}-{number}"
         path = folder / f"{stem}{suffix}"
-        if not path.exists() and stem not in taken:
+        if not path.exists() and stem not in taken_names:
             return path
     raise OutputError(
         f"the folder already contains {_MAX_NAMES:,} files named after {name}", at=Place(folder)
     )
 
 
-def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
+def output_path(cell: str | os.PathLike[str], subfolder: str, suffix: str) -> Path:
     """Return a new path in a folder of a cell, named after today's date; the folder is created.
 
     Args:
         cell: folder of the cell.
-        part: `EXPORTS` or `REPORTS`.
+        subfolder: `EXPORTS` or `REPORTS`.
         suffix: suffix of the file; "" for a folder.
 
     Raises:
         OutputError: the folder cannot be created.
     """
-    folder = Path(cell) / part
+    folder = Path(cell) / subfolder
     try:
         folder.mkdir(exist_ok=True)
     except OSError as problem:
@@ -47,19 +47,19 @@ def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
     return free_path(folder, datetime.date.today().isoformat(), suffix)
 
 
-def save_under_new_name(folder: Path, save: Callable[[Path], object], taken: Collection[str]) -> Path:
+def save_under_new_name(folder: Path, save: Callable[[Path], object], taken_names: Collection[str]) -> Path:
     """Save a model under a new name, today's date, even if other processes save models in the same folder.
 
     Args:
         folder: folder of the models.
         save: function that writes the folder of the model, and refuses an existing folder.
-        taken: other names that are taken, such as names of models whose folders were removed.
+        taken_names: other names that are taken, such as names of models whose folders were removed.
 
     Raises:
         OutputError: the model cannot be written.
     """
     while True:
-        path = free_path(folder, datetime.date.today().isoformat(), "", taken)
+        path = free_path(folder, datetime.date.today().isoformat(), "", taken_names)
         try:
             save(path)
             return path
@@ -68,20 +68,20 @@ def save_under_new_name(folder: Path, save: Callable[[Path], object], taken: Col
                 raise
 
 
-def write_under_new_name(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
+def write_under_new_name(folder: Path, name: str, content: bytes, taken_names: Collection[str]) -> Path:
     """Write a session with a new name, completely or not at all, even if other processes write to the folder.
 
     Args:
         folder: folder of the sessions.
         name: name of the file without ".csv"; see `free_path`.
         content: content of the file.
-        taken: other names that are taken.
+        taken_names: other names that are taken.
 
     Raises:
         OutputError: the file cannot be written.
     """
     while True:
-        path = free_path(folder, name, ".csv", taken)
+        path = free_path(folder, name, ".csv", taken_names)
         try:
             with scratch_beside(path, FILE) as scratch:
                 with scratch.open("wb") as file:

@@ -167,7 +167,7 @@ class Sessions:
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         _check_new(rows, again)
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
-        at = controller.active(day, now())
+        at = controller.active_exports(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).checked_warnings(
             self.folder.parent
         )
@@ -178,7 +178,7 @@ class Sessions:
             seen = self.rows_with_model_names(model, rows, day)
             stated = RecalibrationSettings(seen.changed_frames or None)
             loaded = load_model(self._folder_of(model))
-            verdict = check_rows(seen.rows, loaded, stated.fitted, allowed_moves(stated))
+            verdict = check_rows(seen.rows, loaded, stated.fitted_kinds, allowed_moves(stated))
             training = known_rows(loaded, seen.rows)
             fitted = bool(training.all())
             if not fitted:

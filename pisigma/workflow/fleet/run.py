@@ -199,15 +199,15 @@ class FleetRun:
     seconds: float
 
     @property
-    def cells_done(self) -> int:
-        """Number of cells that need no attention."""
+    def cells_not_refused(self) -> int:
+        """Number of cells that were not refused."""
         return self.cells - len(self.refused)
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as plain values."""
         return {
             "cells": self.cells,
-            "done": self.cells_done,
+            "done": self.cells_not_refused,
             "unchanged": self.unchanged,
             "refused": [{"cell": cell, "reason": reason} for cell, reason in self.refused],
             "seconds": round(self.seconds, 3),

@@ -20,7 +20,7 @@ from pisigma.measurement.camera.detection.video import is_frame, is_video
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.reading import number_column, text_column
 from pisigma.measurement.csv.table import read_table
-from pisigma.measurement.foreign.accounting import sentences
+from pisigma.measurement.foreign.accounting import left_out_sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.joining import JoinBy, join_rows
 from pisigma.reporting.result_text import Table
@@ -189,7 +189,7 @@ def has_image_column(path: str | os.PathLike[str]) -> bool:
 
 
 def join_joint_values(
-    names: Sequence[str], path: str | os.PathLike[str], max_time_difference: float, stops: int = 0
+    names: Sequence[str], path: str | os.PathLike[str], max_time_difference: float, stop_image_count: int = 0
 ) -> JoinedJoints:
     """Return the joint values at which every image was taken.
 
@@ -198,8 +198,8 @@ def join_joint_values(
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
         max_time_difference: largest difference of time stamps [s].
-        stops: number of images that are numbered stops in a video, which must equal the number of rows of the file; 0
-            if there is no video.
+        stop_image_count: number of images that are numbered stops in a video, which must equal the number of rows of
+            the file; 0 if there is no video.
 
     Raises:
         MeasurementError: the file cannot be used, no image has a partner, or the number of stops differs from the
@@ -214,11 +214,11 @@ def join_joint_values(
             value=Phrase(", ".join(table.header)),
             at=table.header_place,
         )
-    if by == "point" and stops not in (0, len(table.lines)):
+    if by == "point" and stop_image_count not in (0, len(table.lines)):
         raise MeasurementError(
             "the stops in the video cannot be paired with the joint values",
             expected=f"{len(table.lines)} stops in the video, one per row",
-            value=stops,
+            value=stop_image_count,
             at=Place(path),
             remedy="let the arm rest for a second at every pose and nowhere else, or log joint values with times",
         )
@@ -239,7 +239,7 @@ def join_joint_values(
     ]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))
-    remarks = (*sentences(joined.unmatched_rows), *joined.warnings, *(unread if others else ()))
+    remarks = (*left_out_sentences(joined.unmatched_rows), *joined.warnings, *(unread if others else ()))
     return JoinedJoints(columns, of_image, remarks)
 
 

@@ -37,7 +37,7 @@ class RecalibrationSettings:
         return shlex.join(["pisigma", "recalibrate", model, data, *stated, "--out", "DIR"])
 
     @property
-    def fitted(self) -> "tuple[FrameKind, ...]":
+    def fitted_kinds(self) -> "tuple[FrameKind, ...]":
         """Frames that were moved, as stated."""
         from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 

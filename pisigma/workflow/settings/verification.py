@@ -32,7 +32,7 @@ class VerificationSettings:
     socket_distances: SocketDistances = field(default_factory=dict)
 
     @property
-    def fitted(self) -> "tuple[FrameKind, ...]":
+    def fitted_kinds(self) -> "tuple[FrameKind, ...]":
         """Frames that are fitted to the rows."""
         from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 

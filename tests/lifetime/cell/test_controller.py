@@ -84,7 +84,7 @@ def test_nothing_is_refused_while_nothing_is_active(command):
 
 
 def test_kinematics_and_joint_zeros_are_active_together():
-    found = controller("dh", "offsets").active()
+    found = controller("dh", "offsets").active_exports()
     assert {name: one.export for name, one in found.items()} == {"kinematics": DH, "joint_zeros": OFFSETS}
     assert controller("dh", "offsets").findings("serve", MODEL, (BEFORE, AFTER)).refusal
     assert len(controller("dh", "offsets").findings("serve", NEWER, (BEFORE, AFTER)).warnings) == 1
@@ -146,7 +146,7 @@ def test_what_cannot_be_active_is_refused(tmp_path, sha256, day, option):
         record_controller(history, sha256, day, "")
     assert history.controller() == ()
     record_controller(history, "dh", "2026-01-20", "at low speed")
-    assert Controller.from_history(history).active()["kinematics"].since == "2026-01-20"
+    assert Controller.from_history(history).active_exports()["kinematics"].since == "2026-01-20"
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_a_model_that_cannot_be_loaded_leaves_the_one_before(cell, loads):
     time.sleep(3 * model_in_use.INTERVAL)
     assert (len(reports), names, in_use.folder.name) == (1, [FIRST], FIRST)
     problems.clear()
-    in_use.check(retry=True)
+    in_use.check(retry_failed=True)
     assert (names, in_use.problem) == ([FIRST, SECOND], "")
     in_use.stop()
 

@@ -56,7 +56,7 @@ LATE = Event("2026-02-01", "instrument", "", "2026-02-11T08:00:00+00:00")
 CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
-    "session_incomplete": (replace(MEASURED, incomplete="3 of 50 poses"), "import"),
+    "session_incomplete": (replace(MEASURED, measured_pose_text="3 of 50 poses"), "import"),
     "several_arms": (replace(PLANNED, unrecorded_files=("a.csv",), has_several_arms=True), ""),
     "not_taken_in": (replace(PLANNED, unrecorded_files=("2026-01-10.csv",)), "import"),
     "file_refused": (
@@ -115,7 +115,7 @@ CASES = {
     "outside_limit": (replace(VERIFIED, limit_mm=0.05), "plan"),
     "limit_below_scatter": (replace(VERIFIED, limit_mm=0.05, in_use=replace(MODEL, scatter_mm=0.018)), ""),
     "verification_due": (replace(VERIFIED, today="2026-09-01"), "plan"),
-    "edited_session": (replace(VERIFIED, edited=("2026-01-10",)), "session"),
+    "edited_session": (replace(VERIFIED, edited_sessions=("2026-01-10",)), "session"),
     "up_to_date": (VERIFIED, ""),
 }
 

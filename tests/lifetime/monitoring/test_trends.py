@@ -39,13 +39,13 @@ def records(months, per_month=0.0, per_kelvin=0.0, rms=lambda month: 1e-4, warm=
 def test_a_drift_is_charted_and_measured():
     drifting = records(8, per_month=0.01)
     joint, other, error = charts_of(JOINTS, drifting)
-    assert (joint.what, joint.unit, other.unit, error.unit) == ("joint 1", "deg", "mm", "mm")
+    assert (joint.quantity, joint.unit, other.unit, error.unit) == ("joint 1", "deg", "mm", "mm")
     assert joint.alarm is not None
     assert joint.alarm <= 4
     assert other.alarm is error.alarm is None
     assert bool(other.values[1].isnan())
     clear = [one for one in trends_of(JOINTS, drifting) if one.is_significant]
-    assert [(one.what, one.per) for one in clear] == [("joint 1", "month")]
+    assert [(one.quantity, one.per) for one in clear] == [("joint 1", "month")]
     low, high = clear[0].interval
     assert low < 0.01 < high
 
@@ -67,7 +67,7 @@ def test_a_jump_is_not_a_drift():
     for record in made[6:]:
         record.zeros.shift[0] += math.radians(0.05)
     (jump,) = jumps_of(JOINTS, made)
-    assert (jump.what, jump.before, jump.after) == ("joint 1", "2026-06-01", "2026-07-01")
+    assert (jump.quantity, jump.before, jump.after) == ("joint 1", "2026-06-01", "2026-07-01")
     assert_close(jump.size, 0.05, atol=0.005)
     assert not [one for one in trends_of(JOINTS, made) if one.is_significant]
     assert jumps_of(JOINTS, records(8, per_month=0.01)) == jumps_of(JOINTS, records(8)) == ()
@@ -92,7 +92,7 @@ def test_jumps_and_outliers_are_distinguished_from_a_drift(off, changes, per_mon
     for month, size in off.items():
         made[month].zeros.shift[0] += math.radians(size)
     found = jumps_of(JOINTS, made)
-    assert [(one.what, one.after, one.is_single_session) for one in found] == [
+    assert [(one.quantity, one.after, one.is_single_session) for one in found] == [
         ("joint 1", *one[:2]) for one in changes
     ]
     for one, (_, _, size) in zip(found, changes, strict=True):
@@ -109,7 +109,7 @@ def test_a_jump_of_the_error_is_not_extrapolated():
 def test_warming_is_not_a_drift_with_time():
     warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
     clear = [one for one in trends_of(JOINTS, warmed) if one.is_significant]
-    assert [(one.what, one.per) for one in clear] == [("joint 1", "kelvin")]
+    assert [(one.quantity, one.per) for one in clear] == [("joint 1", "kelvin")]
     assert_close(clear[0].slope, 0.002, rtol=0.3)
 
 

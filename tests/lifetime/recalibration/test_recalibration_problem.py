@@ -42,7 +42,7 @@ def test_the_prior_is_the_posterior_of_the_model():
     elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
     base = elsewhere.design.problem.space.indices_of("base")
     assert not elsewhere.covariance_root[base.start : base.stop].any()
-    assert [group.what for group in elsewhere.groups if group.fixed_size] == ["base"]
+    assert [group.name for group in elsewhere.groups if group.fixed_size] == ["base"]
     still = problem.with_fixed_arm()
     assert still.covariance_root.shape[1] == 0
     assert still.groups == ()

@@ -6,7 +6,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.accounting import sentences
+from pisigma.measurement.foreign.accounting import left_out_sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.joining import join_rows
 
@@ -32,7 +32,7 @@ def test_names_differ_in_groups_case_and_zeros():
         ("points", 4, "p9"),
         ("log", 4, "p3"),
     ]
-    assert "line 4 (p9)" in sentences(joined.unmatched_rows)[0]
+    assert "line 4 (p9)" in left_out_sentences(joined.unmatched_rows)[0]
     (warning,) = joined.warnings
     assert warning.startswith("log: roll_deg ")
     assert joined.rows.cells["payload_kg"] == ("2", "1")

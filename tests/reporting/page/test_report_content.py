@@ -158,7 +158,7 @@ def test_the_workspace_is_shown_without_rows(hybrid, tmp_path):
     assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
     assert len(content.map.position) == 3000
     assert (content.map.rows, content.map.random_points) == (0, 3000 - len(hybrid[1].starts))
-    assert content.missing
+    assert content.missing_figures
     assert content.dependences == ()
 
 
@@ -167,7 +167,7 @@ def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
     content = report_content(model, tmp_path, measured(arm, 80, seed=9))
     assert list(content.accuracies[0].models) == ["nominal", "geometric"]
     assert content.curves == ()
-    assert len(content.missing) == 1  # no predicted accuracy
+    assert len(content.missing_figures) == 1  # no predicted accuracy
     assert (content.limit.scatter, content.limit.scatter_share) == (None, None)
     assert content.summary == CalibrationSummary.read(model)
 

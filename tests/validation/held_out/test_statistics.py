@@ -80,7 +80,7 @@ def test_a_model_explains_what_it_predicts():
     model = hand_made_model("kiro4")
     q = joints_around("kiro4", 10, seed=3)
     found = compare_with_nominal(model, measured(model.forward(q), q))
-    assert found.not_predicted == 0
+    assert found.rows_not_predicted == 0
     assert_close(found.corrected.position, 0.0, atol=1e-12)
     assert float(found.nominal.position.min()) > 1e-4
 
@@ -90,7 +90,7 @@ def test_comparison_is_on_the_same_rows():
     nominal = PoseErrors(torch.tensor([1.0, 2.0, nan, 4.0], dtype=torch.float64), None)
     corrected = PoseErrors(torch.tensor([0.5, nan, nan, 0.5], dtype=torch.float64), None)
     found = Comparison.from_errors(nominal, corrected)
-    assert found.not_predicted == 1  # the third row was not measured
+    assert found.rows_not_predicted == 1  # the third row was not measured
     assert torch.equal(found.nominal.position.isnan(), corrected.position.isnan())
     assert_close(found.nominal.figures.mean_mm, 2500.0)
     assert_close(found.corrected.figures.mean_mm, 500.0)

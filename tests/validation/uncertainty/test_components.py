@@ -90,7 +90,10 @@ def test_missing_components_are_named_and_do_not_contribute():
         original_model(), rows_after_change(12, 3), "a", Instrument(), {"a": None}, ("a",), None
     )
     assert [one.evaluation for one in found.components] == ["A", "A"]
-    assert [line.partition(":")[0] for line in found.missing] == ["instrument", "thermal expansion"]
+    assert [line.partition(":")[0] for line in found.missing_components] == [
+        "instrument",
+        "thermal expansion",
+    ]
 
 
 SEEDS, REPEATABILITY, NOISE, SCALE = 6, 30e-6, 5e-6, 15e-6

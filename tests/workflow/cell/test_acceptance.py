@@ -42,7 +42,7 @@ def _stated(cell, text=STATED):
 def test_what_is_not_stated_is_named(cell):
     found = acceptance_of(cell)
     assert [one.evaluation for one in found.budget.components] == ["A", "A"]
-    names = [line.partition(":")[0] for line in found.not_stated]
+    names = [line.partition(":")[0] for line in found.not_stated_sentences]
     assert names.count("instrument") == 5
     assert {"thermal expansion", "pose repeatability of the maker", "AP and RP", "AT and RT"} < set(names)
     assert found.temperature_span is None
@@ -58,11 +58,11 @@ def test_what_is_stated_is_in_the_budget(cell):
     assert_close(found.budget.combined_uncertainty, math.sqrt(sum(one**2 for one in u)))
     assert (found.measured.session, found.measured.rows) == ("2026-06-01", 10)
     assert found.measured.errors.statistics["p95"] < found.budget.coverage_radius * 1e3
-    assert not found.contradicted
+    assert not found.is_contradicted
 
 
 def test_errors_that_the_budget_does_not_explain_are_found(cell):
-    assert acceptance_of(_stated(cell)).contradicted
+    assert acceptance_of(_stated(cell)).is_contradicted
 
 
 def test_repeated_poses_after_the_instrument_was_moved_have_no_accuracy(cell):
@@ -79,7 +79,7 @@ def test_repeated_poses_after_the_instrument_was_moved_have_no_accuracy(cell):
     cell.add_session(rows, day="2026-09-10")
     found = acceptance_of(cell)
     assert (found.measured.session, found.measured.fitted) == ("2026-09-10", ("base",))
-    assert not found.contradicted
+    assert not found.is_contradicted
     assert [(one.rows, one.accuracy, one.repeatability) for one in found.repeats] == [(2, None, None)] * 4
     assert found.to_json()["repeats"]["degrees_of_freedom"] == 12
 

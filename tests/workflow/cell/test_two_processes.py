@@ -45,7 +45,7 @@ def test_two_processes_work_on_one_cell(tmp_path):
     assert refusals.get() in (0, 1)
     assert refusals.empty()
     assert sorted(one.rows for one in cell.history.sessions()) == [12, 12, 40]
-    assert cell.status().facts.unrecorded_files == cell.status().facts.edited == ()
+    assert cell.status().facts.unrecorded_files == cell.status().facts.edited_sessions == ()
     assert len(list((cell.folder / "plans").glob("*.csv"))) == 2
     assert len({one.name for one in cell.history.models()}) == 2
     for one in cell.history.models():

@@ -74,7 +74,7 @@ def table_of(run):
 
 def test_an_invalid_file_is_named_and_does_not_affect_the_others(first):
     run, plant = first, first.results.parent
-    assert (run.cells, run.cells_done, run.unchanged) == (3, 2, 0)
+    assert (run.cells, run.cells_not_refused, run.unchanged) == (3, 2, 0)
     ((cell, reason),) = run.refused
     assert cell == "r2"
     assert "2026-10-01.csv" in reason
@@ -101,7 +101,7 @@ def test_a_later_call_continues(first):
     assert run_fleet(plant, ONE_JOB).results.read_bytes() == content
     rows_after_change(31, 5).write_csv(plant / "r2" / "sessions" / "2026-10-01.csv", original_model().robot)
     last = run_fleet(plant, ONE_JOB)
-    assert (last.unchanged, last.cells_done, last.refused) == (2, 3, ())
+    assert (last.unchanged, last.cells_not_refused, last.refused) == (2, 3, ())
 
 
 def test_a_cell_is_calibrated_again_if_its_model_is_gone_or_its_settings_were_edited(first):
@@ -141,4 +141,4 @@ def test_a_full_disk_loses_nothing_and_a_later_call_continues(plant):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(dict(full.refused)) == ["r0", "r1", "r2"]
     assert not list(plant.rglob("model.yaml"))
-    assert run_fleet(plant, ONE_JOB).cells_done == 2
+    assert run_fleet(plant, ONE_JOB).cells_not_refused == 2

@@ -97,7 +97,7 @@ def joint_scatter_factor(
     share = share.clamp(0.0, 1.0)
     square = (axes.mT @ part.residual[:, rows].t()[..., None])[..., 0].square() / scale.square()
     absorbed = _absorbed(problem, linearisation, number, rows, axes) / scale.square()
-    weight = problem.loss.weight(part.distance[rows] / scale, sensor.components)[:, None]
+    weight = problem.loss.weight(part.residual_length[rows] / scale, sensor.components)[:, None]
     left = weight * (1 - absorbed).clamp(min=0.0)
     shares = torch.stack([share, 1 - share])
     if bool(((shares.square() * left).sum((1, 2)) < _MIN_VALUES).any()):

@@ -36,14 +36,14 @@ class SensorContribution:
         normal: `Σ w J J^T / sigma_row²` over the rows of the sensor.
         descent: `Σ w J r / sigma_row²`, the right-hand side of the normal equations.
         residual: measured minus predicted values [m or rad]; 0 in rows without a value.
-        distance: length of the residual divided by sigma_row; 0 in rows without a value.
+        residual_length: length of the residual divided by sigma_row; 0 in rows without a value.
         measured_rows: number of measured rows.
     """
 
     normal: Float64[Tensor, "active active"]
     descent: Float64[Tensor, " active"]
     residual: Float64[Tensor, "components rows"]
-    distance: Float64[Tensor, " rows"]
+    residual_length: Float64[Tensor, " rows"]
     measured_rows: int
 
     @property
@@ -62,7 +62,7 @@ def joined_contributions(chunks: Sequence[SensorContribution]) -> SensorContribu
         normal=torch.stack([part.normal for part in chunks]).sum(0),
         descent=torch.stack([part.descent for part in chunks]).sum(0),
         residual=torch.cat([part.residual for part in chunks], 1),
-        distance=torch.cat([part.distance for part in chunks]),
+        residual_length=torch.cat([part.residual_length for part in chunks]),
         measured_rows=first.measured_rows,
     )
 
@@ -147,7 +147,7 @@ def loss_scale(
         if sensor.is_stated:
             scales.append(torch.ones_like(effective_parameters[k]))
             continue
-        distance = view.contributions[k].distance
+        distance = view.contributions[k].residual_length
         if view.contributions[k].measured_rows < len(distance):
             distance = distance[sensor.present]
         if refine:
@@ -162,7 +162,7 @@ def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLos
     """Return whether the loss gives any row the weight 0."""
     of_each = zip(sensors, losses, view.contributions, view.scales, strict=True)
     return any(
-        bool((loss.weight(part.distance / scale, sensor.components) == 0).any())
+        bool((loss.weight(part.residual_length / scale, sensor.components) == 0).any())
         for sensor, loss, part, scale in of_each
     )
 
@@ -201,7 +201,7 @@ def group_variance_ratio(
         ratios.append(ratio)
         if sensor.is_stated:
             continue
-        weight = loss.weight(part.distance / view.scales[k], sensor.components) * sensor.present
+        weight = loss.weight(part.residual_length / view.scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
             weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
         square, values = _group_squares(part.residual, weight, pose)

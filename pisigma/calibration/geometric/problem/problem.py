@@ -300,7 +300,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if self.held_directions is not None:
             normal, descent = self.held_directions.restrict(normal, descent, self.step_scale)
         costs = [
-            self.loss_for_sensor(sensor).cost(part.distance / view.scales[k], sensor.components).sum()
+            self.loss_for_sensor(sensor).cost(part.residual_length / view.scales[k], sensor.components).sum()
             for k, (sensor, part) in enumerate(zip(self.sensors, view.contributions, strict=True))
         ]
         misfit = (torch.stack(costs) * view.scales.square() / view.variances).sum()

@@ -42,36 +42,37 @@ def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
 
 
 def with_known_names(
-    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
+    model: CalibratedModel, rows: Measurements, fitted_kinds: Collection[FrameKind]
 ) -> Measurements:
     """Replace the names of fitted frames and targets with any name of the model, because their poses do not matter."""
-    if "base" in fitted:
+    if "base" in fitted_kinds:
         rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
-    if "tool" in fitted:
+    if "tool" in fitted_kinds:
         rows = replace(rows, target=(next(iter(model.tools), ""),) * rows.rows)
     return rows
 
 
-def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[str, ...]:
+def fitted_remark(rows: Measurements, fitted_kinds: Collection[FrameKind]) -> tuple[str, ...]:
     """Write a remark on errors in fitted frames; empty if none is fitted."""
-    if not fitted:
+    if not fitted_kinds:
         return ()
     turned = rows.rotation is not None
     numbers = {
-        "frame": 6 * len(set(rows.frame)) * ("base" in fitted),
-        "tool": (6 if turned else 3) * len(set(rows.target)) * ("tool" in fitted),
+        "frame": 6 * len(set(rows.frame)) * ("base" in fitted_kinds),
+        "tool": (6 if turned else 3) * len(set(rows.target)) * ("tool" in fitted_kinds),
     }
     what = " and ".join(f"the {name} ({count} parameters)" for name, count in numbers.items() if count)
     values = _readings(rows) * (6 if turned else 3)
     return (
-        f"For every model, these rows are used to fit {what}, so errors of the robot's {' or '.join(fitted)} are not "
-        f"included. The errors are corrected for this: their squares are divided by {values - sum(numbers.values())} "
+        f"For every model, these rows are used to fit {what}, so errors of the robot's {' or '.join(fitted_kinds)} are "
+        f"not included. The errors are corrected for this: their squares are divided by "
+        f"{values - sum(numbers.values())} "
         f"degrees of freedom ({values} values minus {sum(numbers.values())} fitted parameters).",
     )
 
 
 def errors_in_fitted_frames(
-    model: CalibratedModel, measurements: Measurements, fitted: Collection[FrameKind]
+    model: CalibratedModel, measurements: Measurements, fitted_kinds: Collection[FrameKind]
 ) -> ErrorVectors:
     """Compute errors under a model, with frames or targets fitted, as after a sensor or a reflector was moved.
 
@@ -83,7 +84,7 @@ def errors_in_fitted_frames(
     Args:
         model: a model of any kind; its frames or targets are not used if they are fitted.
         measurements: rows with positions, and optionally orientations.
-        fitted: what is fitted; empty for the errors in the frames of the model.
+        fitted_kinds: what is fitted; empty for the errors in the frames of the model.
 
     Returns:
         Measured minus predicted values, see `errors_of_rows`; NaN where nothing was measured or predicted, and in rows
@@ -94,13 +95,14 @@ def errors_in_fitted_frames(
             positions to fit to, or the model lacks a frame or target that is not fitted.
         IdentificationError: an anchor has too few rows to determine its position.
     """
-    T = poses_of_rows(model, with_known_names(model, measurements, fitted))
-    if not fitted:
+    T = poses_of_rows(model, with_known_names(model, measurements, fitted_kinds))
+    if not fitted_kinds:
         return errors_of_rows(T, measurements)
     if measurements.position is None:
         given = " and ".join(sorted(measurements.kinds)) or "none"
         raise MeasurementError(
-            f"expected measured positions, to which the {' and the '.join(fitted)} can be fitted, got {given}",
+            f"expected measured positions, to which the {' and the '.join(fitted_kinds)} can be fitted, "
+            f"got {given}",
             expected="positions",
             value=given,
             at=Place(measurements.source),
@@ -109,10 +111,10 @@ def errors_in_fitted_frames(
         )
     usable = torch.isfinite(measurements.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
     rows = measurements.select(usable.nonzero()[:, 0])
-    _check_configurations(model, measurements, rows, fitted)
-    known = rows if has_orientation(model) or "tool" in fitted else replace(rows, rotation=None)
+    _check_configurations(model, measurements, rows, fitted_kinds)
+    known = rows if has_orientation(model) or "tool" in fitted_kinds else replace(rows, rotation=None)
     measured = MeasuredPoses.from_tensors(known.position, known.rotation, LEVER_SHARE * model.robot.reach)
-    fit, columns = fit_frames(T[usable], measured, rows, fitted)
+    fit, columns = fit_frames(T[usable], measured, rows, fitted_kinds)
     T = T.index_put((usable.nonzero()[:, 0],), fit)
     leverage = orthonormal_columns(columns.flatten(0, 1)).square().sum(-1).view(-1, 2, 3).sum((0, 2)).tolist()
     errors = ErrorVectors.from_prediction(measurements, T)
@@ -135,14 +137,17 @@ def _enlargement(rows: Measurements, fitted: float) -> float:
 
 
 def _check_configurations(
-    model: CalibratedModel, measurements: Measurements, rows: Measurements, fitted: Collection[FrameKind]
+    model: CalibratedModel,
+    measurements: Measurements,
+    rows: Measurements,
+    fitted_kinds: Collection[FrameKind],
 ) -> None:
     """Refuse frames and targets with too few rows for a fit."""
     names = {
         "base": ("frame", measurements.frame, rows.frame),
         "tool": ("target", measurements.target, rows.target),
     }
-    for kind in fitted:
+    for kind in fitted_kinds:
         what, wanted, there = names[kind]
         for name in dict.fromkeys(wanted):
             of_name = torch.tensor(
@@ -161,7 +166,10 @@ def _check_configurations(
 
 
 def fit_frames(
-    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, rows: Measurements, fitted: Collection[FrameKind]
+    T: Float64[Tensor, "rows 4 4"],
+    measured: MeasuredPoses,
+    rows: Measurements,
+    fitted_kinds: Collection[FrameKind],
 ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "rows 6 numbers"]]:
     """Fit bases and tools of rows to their measured poses.
 
@@ -171,26 +179,26 @@ def fit_frames(
         T: predicted poses, with any bases and tools.
         measured: measured poses of the rows.
         rows: the rows, with the names of frames and targets.
-        fitted: what is fitted.
+        fitted_kinds: what is fitted.
 
     Returns:
         The poses, and the derivatives of their values with respect to all fitted parameters, see `frame_jacobian`.
     """
     frame, target = numbers_of_names(rows.frame), numbers_of_names(rows.target)
     bases, tools = (torch.eye(4).to(T).repeat(int(number.max()) + 1, 1, 1) for number in (frame, target))
-    if "base" in fitted:
+    if "base" in fitted_kinds:
         bases = _each(best_base, T, measured, frame)
-    if "tool" in fitted:
+    if "tool" in fitted_kinds:
         tools = _each(best_tool, bases[frame] @ T, measured, target)
-    columns, error = _columns(T, measured, (bases, frame), (tools, target), fitted)
+    columns, error = _columns(T, measured, (bases, frame), (tools, target), fitted_kinds)
     damping = INITIAL_DAMPING
-    for _ in range(MAX_ITERATIONS if len(fitted) > 1 else 0):
+    for _ in range(MAX_ITERATIONS if len(fitted_kinds) > 1 else 0):
         A = columns.flatten(0, 1)
         normal = A.mT @ A
         damped = normal + torch.diag(damping * normal.diagonal() + 1e-12 * len(T))
         steps = torch.linalg.solve(damped, A.mT @ error.flatten()).view(-1, 6)
         moved = moved_frame(bases, steps[: len(bases)]), moved_frame(tools, steps[len(bases) :])
-        tried = _columns(T, measured, (moved[0], frame), (moved[1], target), fitted)
+        tried = _columns(T, measured, (moved[0], frame), (moved[1], target), fitted_kinds)
         gain = float(error.square().sum() - tried[1].square().sum())
         if gain > 0:
             settled = gain <= CONVERGENCE_TOLERANCE * float(error.square().sum())
@@ -218,7 +226,7 @@ def _columns(
     measured: MeasuredPoses,
     bases: tuple[Tensor, Int64[Tensor, " rows"]],
     tools: tuple[Tensor, Int64[Tensor, " rows"]],
-    fitted: Collection[FrameKind],
+    fitted_kinds: Collection[FrameKind],
 ) -> tuple[Float64[Tensor, "rows 6 numbers"], Float64[Tensor, "rows 6"]]:
     """Compute derivatives with respect to the fitted bases and tools, and the errors; see `frame_jacobian`."""
     J, error = frame_jacobian(T, measured, bases[0][bases[1]], tools[0][tools[1]])
@@ -226,7 +234,7 @@ def _columns(
     for kind, (frames, number), part in zip(
         ("base", "tool"), (bases, tools), torch.split(J, 6, -1), strict=True
     ):
-        if kind in fitted:
+        if kind in fitted_kinds:
             of_row = torch.nn.functional.one_hot(number, len(frames)).to(part)
             blocks.append((of_row[:, None, :, None] * part[:, :, None, :]).flatten(2))
     return torch.cat(blocks, -1), error
