@@ -131,9 +131,9 @@ def gate() -> None:
                 few, others = drawn(series(after), count, draw)
                 result = recalibrate(model_of(before), few)
                 errors = candidates_of(result, few, others)
-                kept, best = kept + errors[result.summary.kept], best + min(errors.values())
-                ratios.append(errors[result.summary.kept] / min(errors.values()))
-                chosen.append(result.summary.kept)
+                kept, best = kept + errors[result.summary.kept_candidate], best + min(errors.values())
+                ratios.append(errors[result.summary.kept_candidate] / min(errors.values()))
+                chosen.append(result.summary.kept_candidate)
             counts = {name: chosen.count(name) for name in dict.fromkeys(chosen)}
             print(
                 f"{before} to {after}, {count} rows: {np.mean(ratios):.3f} of the best (means {kept / best:.3f}), "

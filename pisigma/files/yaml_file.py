@@ -28,6 +28,12 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class StoredFigures(Section):
+    """Base class of figures whose keys in files may have other names than their fields: `Field(alias=KEY)`."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 """Seed of a random number generator."""
 MAX_POSES = 100_000

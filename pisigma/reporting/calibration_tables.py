@@ -99,9 +99,9 @@ def trial_table(hybrid: HybridFigures) -> Table:
             trial.name,
             str(trial.unknowns),
             "" if trial.log_evidence is None else f"{trial.log_evidence:.1f}",
-            f"{trial.left_out:.3f}",
+            f"{trial.held_out_ratio:.3f}",
             f"{trial.seconds:.1f}",
-            "yes" if trial.kept else "no",
+            "yes" if trial.is_improvement else "no",
         )
         for trial in hybrid.trials
     ]

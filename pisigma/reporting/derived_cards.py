@@ -68,8 +68,10 @@ def candidate_table(summary: RecalibrationSummary) -> Table:
     rows = (
         (
             names[name],
-            "too few rows" if errors.rms_mm is None else rounded_text(errors.rms_mm, summary.left_out),
-            "yes" if name == summary.kept else "no",
+            "too few rows"
+            if errors.rms_mm is None
+            else rounded_text(errors.rms_mm, summary.held_out_row_count),
+            "yes" if name == summary.kept_candidate else "no",
         )
         for name, errors in summary.cross_validation.items()
     )
@@ -104,7 +106,7 @@ def size_table(summary: DistillationSummary) -> Table:
             str(size.harmonics),
             str(size.unknowns),
             number_text(size.rms_mm),
-            "yes" if size.kept else "no",
+            "yes" if size.is_selected else "no",
         )
         for size in summary.sizes
     )
@@ -157,7 +159,7 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
 def common_error_table(summary: FleetPriorSummary) -> Table:
     """Return a table of the mean and the standard deviation between robots of every geometric parameter."""
     rows = (
-        (one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}", "in a sum" if one.in_a_sum else "")
+        (one.name, one.unit, f"{one.mean:z.4f}", f"{one.sigma:.4f}", "in a sum" if one.in_a_sum else "")
         for one in summary.parameters
     )
     return Table(("parameter", "unit", "mean", "between robots", "remark"), tuple(rows))
@@ -166,5 +168,6 @@ def common_error_table(summary: FleetPriorSummary) -> Table:
 def spectrum_table(summary: FleetPriorSummary) -> Table:
     """Return a table of standard deviations between robots of the weights of the joint correction, by group."""
     return Table(
-        ("weights", "between robots [deg]"), tuple((one.group, f"{one.deg:.5f}") for one in summary.spectrum)
+        ("weights", "between robots [deg]"),
+        tuple((one.group, f"{one.sigma_deg:.5f}") for one in summary.spectrum),
     )

@@ -54,9 +54,9 @@ def cause_table(summary: FrameSummary) -> Table:
         (
             CAUSES[one.cause],
             f"{one.log_bayes_factor:.1f}",
-            f"{100 * one.share:.0f}",
+            f"{100 * one.explained_share:.0f}",
             one.size if one.log_bayes_factor > 0 else "",
-            "yes" if one.named else "no",
+            "yes" if one.is_supported else "no",
         )
         for one in summary.causes
     )
@@ -65,14 +65,14 @@ def cause_table(summary: FrameSummary) -> Table:
 
 def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
     """Return what causes the residuals and what to do; "" if the residuals are only noise."""
-    named = [one for one in summary.causes if one.named]
+    named = [one for one in summary.causes if one.is_supported]
     if not named:
         return ()
     first = named[0]
     rivals = [
         CAUSES[one.cause]
         for one in summary.causes
-        if not one.named and one.log_bayes_factor > first.log_bayes_factor - CLEAR
+        if not one.is_supported and one.log_bayes_factor > first.log_bayes_factor - CLEAR
     ]
     which = " and the ".join(f"{CAUSES[one.cause]}, {one.size}" for one in named)
     unclear = f" The rows hardly distinguish this cause from: {', '.join(rivals)}." if rivals else ""
@@ -159,14 +159,14 @@ def base_rows(figures: ArmBaseFigures) -> list[tuple[str, ...]]:
         error = figures.standard_errors[number] if number < 3 else max(figures.standard_errors[3:])
         digits = min(max(1 - math.floor(math.log10(max(error, 1e-6))), 1), 6)
         shown = f"{figures.standard_errors[number]:.{digits}f}" if number < 3 else ""
-        rows.append((figures.arm, figures.in_base_of, axis, unit, f"{value:.{digits}f}", shown))
+        rows.append((figures.arm, figures.other_arm, axis, unit, f"{value:.{digits}f}", shown))
     return rows
 
 
 def rotation_lines(summary: ArmsSummary) -> list[str]:
     """Return a sentence on the standard errors of the rotation of every base."""
     return [
-        f"The rotation of the base of '{one.arm}' about x, y, z of '{one.in_base_of}' has standard errors of "
+        f"The rotation of the base of '{one.arm}' about x, y, z of '{one.other_arm}' has standard errors of "
         f"{', '.join(rounded_text(error, 0) for error in one.standard_errors[3:])} deg."
         for one in summary.bases
     ]

@@ -254,7 +254,7 @@ def _limitations(
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
     harmonics = max((one.highest_harmonic for one in features), default=1)
-    inputs = next(size.harmonics for size in sizes if size.kept)
+    inputs = next(size.harmonics for size in sizes if size.is_selected)
     if harmonics > inputs:
         sentences.append(
             f"Fast ripple: the parent corrects joints with up to {harmonics} cycles per turn, while this network uses "
@@ -283,7 +283,7 @@ def _limitations(
 def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
     """Return the error with only sines and cosines of the joints, if this was tried but not chosen."""
     smooth = [size for size in sizes if size.harmonics == 1]
-    if not smooth or any(size.kept for size in smooth):
+    if not smooth or any(size.is_selected for size in smooth):
         return ""
     error = min(size.rms_mm for size in smooth)
     return f" (with sines and cosines of the joints alone it would be {error:.4f} mm RMS)"

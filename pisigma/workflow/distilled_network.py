@@ -131,7 +131,7 @@ def choose_network(
             harmonics=size.harmonics,
             unknowns=size.unknowns(parent.robot),
             rms_mm=error * 1e3,
-            kept=k == kept,
+            is_selected=k == kept,
         )
         for k, (_, size, error) in enumerate(fits)
     )

@@ -91,7 +91,9 @@ class Recalibration(AbstractModelResult):
     def position_errors_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors of held-out rows [mm]; see `AbstractModelResult`."""
         p95 = self.candidate_choice.p95.get(self.candidate_choice.kept)
-        return None if p95 is None else p95 * 1e3, self.summary.cross_validation[self.summary.kept].rms_mm
+        return None if p95 is None else p95 * 1e3, self.summary.cross_validation[
+            self.summary.kept_candidate
+        ].rms_mm
 
     def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
         write_recalibration_card(model, summary, folder)
@@ -173,12 +175,12 @@ def recalibrate(
         warnings=(*again, *summary.warnings),
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
         outliers=outliers,
-        elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
+        relocated_frames=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
     )
     if diagnostics:
-        summary = summary.with_figures(changed=NOT_TRUSTED)
+        summary = summary.with_figures(change_sentence=NOT_TRUSTED)
     if consistency is not None:
-        summary = summary.with_figures(changed=consistency.sentence)
+        summary = summary.with_figures(change_sentence=consistency.sentence)
     kept = with_wide_limits(replace(kept, metrics=summary.to_json()), rows)
     return Recalibration(
         kept, parent, adaptation, choice, moved or (), summary, seconds=time.perf_counter() - started
@@ -267,16 +269,16 @@ def _summary(
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
         date=datetime.date.today().isoformat(),
         rows=rows.rows,
-        kept=choice.kept,
+        kept_candidate=choice.kept,
         verdict=choice.sentence,
-        left_out=choice.rows,
+        held_out_row_count=choice.rows,
         cross_validation={
             name: HeldOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in choice.rms.items()
         },
-        changed=_UNBELIEVABLE if moved is None else movements_text(moved),
-        moved=moved or (),
-        elsewhere=(),
+        change_sentence=_UNBELIEVABLE if moved is None else movements_text(moved),
+        movements=moved or (),
+        relocated_frames=(),
         effective_parameters=adaptation.effective_unknowns,
         noise=dict(adaptation.noise.value),
         warnings=_warnings(parent, choice, rows),

@@ -196,7 +196,7 @@ def recalibration_text(recalibration: Recalibration, folder: Path | None) -> Res
         (*warnings, *(one.sentence for one in summary.outliers)),
         (
             sentence_block("which model is kept", [summary.verdict]),
-            table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
+            table_block(f"errors of {summary.held_out_row_count} held-out rows", *candidate_table(summary)),
         ),
         closing_sentences=() if folder is None else (written,),
     )
@@ -207,17 +207,18 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
     summary, names = recalibration.summary, candidate_names(recalibration.summary)
     errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
     texts = {
-        name: f"{names[name]} {rounded_text(error, summary.left_out)} mm" for name, error in errors.items()
+        name: f"{names[name]} {rounded_text(error, summary.held_out_row_count)} mm"
+        for name, error in errors.items()
     }
-    first = texts.pop(summary.kept, "not known: too few rows")
+    first = texts.pop(summary.kept_candidate, "not known: too few rows")
     others = f"; {', '.join(texts.values())}" if texts else ""
     count = len(summary.warnings) + len(summary.outliers)
     cautions = f"with caution ({count_text(count, 'warning')})" if count else "yes"
     return Verdict(
-        f"{first} RMS, held out in cross-validation of {summary.left_out} new rows{others}.",
+        f"{first} RMS, held out in cross-validation of {summary.held_out_row_count} new rows{others}.",
         f"no: {summary.diagnostics[0].sentence}"
         if summary.diagnostics
-        else f"{cautions}: {uncapitalised(summary.changed)}",
+        else f"{cautions}: {uncapitalised(summary.change_sentence)}",
         f"verify with other poses: `pisigma verify {folder} ROWS.csv`."
         if folder is not None
         else "run it with --out DIR instead of --dry-run to write this model."

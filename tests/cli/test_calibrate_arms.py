@@ -97,7 +97,7 @@ def test_every_arm_has_a_model_and_the_file_has_their_bases(calibrated):
     assert_close(
         covariance.diagonal().sqrt(), torch.tensor(base.standard_errors, dtype=torch.float64), rtol=1e-9
     )
-    assert (written.redundancy, len(written.diagnostics), written.sums) == (6, 0, ())
+    assert (written.redundancy, len(written.diagnostics), written.indeterminate_sums) == (6, 0, ())
 
 
 def test_frame_that_moved_between_the_arms_is_not_trusted(disagreeing, tmp_path):
@@ -147,9 +147,9 @@ def test_sum_of_base_and_tool_is_named():
     found = calibrate_arms(arms)
     (base,) = found.summary.bases
     assert_close(base.z_mm, 5.0, atol=0.01)
-    assert len(found.summary.sums) == 2
-    assert all("tool_z" in sentence for sentence in found.summary.sums)
-    assert set(found.summary.sums) <= set(found.warnings)
+    assert len(found.summary.indeterminate_sums) == 2
+    assert all("tool_z" in sentence for sentence in found.summary.indeterminate_sums)
+    assert set(found.summary.indeterminate_sums) <= set(found.warnings)
 
 
 def test_other_commands_ask_for_one_arm(calibrated, refuses):

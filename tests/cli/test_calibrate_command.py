@@ -137,12 +137,8 @@ def test_people_read_the_verdict_first_and_everything_on_demand(capsys, calibrat
     folder, printed = calibrated
     summary = CalibrationSummary.read(load_model(folder))
     errors = printed["cross_validation"]["geometric"]
-    figures = (
-        f"{rounded_text(errors['rms_mm'], 60)} mm",
-        f"{rounded_text(errors['p95_mm'], 60)}",
-        "3-fold",
-        "60 rows",
-    )
+    rms, p95 = rounded_text(errors["rms_mm"], 60), rounded_text(errors["p95_mm"], 60)
+    figures = f"{rms} mm", p95, "3-fold", "60 rows"
     print_result(calibration_text(summary, folder, 1.0), verbose=False)
     text = capsys.readouterr().out
     assert_screen(text, *figures, "--verbose", str(folder))

@@ -100,7 +100,7 @@ def test_trials_are_listed_in_order(arm):
 
 
 def test_trials_without_evidence_have_an_empty_cell(arm):
-    trial = TrialFigures(name="x", unknowns=3, log_evidence=None, left_out=0.5, seconds=1.0, kept=False)
+    trial = TrialFigures(name="x", unknowns=3, log_evidence=None, held_out_ratio=0.5, seconds=1.0, kept=False)
     hybrid = summarise(arm.result).hybrid.model_copy(update={"trials": (trial,)})
     assert trial_table(hybrid).rows == (("x", "3", "", "0.500", "1.0", "no"),)
 

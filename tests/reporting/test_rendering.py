@@ -6,7 +6,7 @@ from pisigma.validation.held_out.calibration_summary import NoiseFigures, Outlie
 
 
 def outlier(row):
-    return OutlierFigures(row=row, place=f"a.csv, line {row}", sensor="position", deviations=9.0)
+    return OutlierFigures(row=row, place=f"a.csv, line {row}", sensor="position", residual_in_sigmas=9.0)
 
 
 def test_paragraphs_of_a_macro_are_sentences_of_their_own():
@@ -27,8 +27,8 @@ def test_a_macro_may_be_empty():
 def test_noise_is_stated_in_the_unit_of_its_sensor():
     stated = NoiseFigures(sensor="position", values=9, used_by_parameters=1.0, factor_on_stated_sigma=1.5)
     turning = NoiseFigures(sensor="rotation", values=9, used_by_parameters=1.0, sigma_deg=0.01)
-    assert "1.5 times" in sentences("calibration.txt.j2", "noise", stated)[0]
-    assert "0.01 deg" in sentences("calibration.txt.j2", "noise", turning)[0]
+    assert "1.5 times" in render_sentences("calibration.txt.j2", "noise", stated)[0]
+    assert "0.01 deg" in render_sentences("calibration.txt.j2", "noise", turning)[0]
 
 
 def test_a_card_ends_with_a_line(tmp_path):

@@ -152,7 +152,7 @@ def test_the_smallest_size_that_is_good_is_kept():
     found = distilled("hybrid", "kiro3", None, 800)
     sizes = found.summary.sizes
     assert [size.orders for size in sizes][:2] == [(1, 2), (1, 2, 3)]
-    (kept,) = (size for size in sizes if size.kept)
+    (kept,) = (size for size in sizes if size.is_selected)
     assert kept.rms_mm <= max(1.1 * min(size.rms_mm for size in sizes), 5e-3)
     assert kept.harmonics == sizes[-1].harmonics > 1
 

@@ -47,7 +47,7 @@ def test_the_moved_joint_and_the_kept_candidate_are_reported(after_collision):
 def test_its_folder_is_a_model_that_can_be_recalibrated_again(after_collision, tmp_path):
     after_collision.save(tmp_path / "again")
     card = (tmp_path / "again" / "README.md").read_text()
-    for sentence in (after_collision.summary.changed, after_collision.summary.verdict):
+    for sentence in (after_collision.summary.change_sentence, after_collision.summary.verdict):
         assert sentence in card
     model = load_model(tmp_path / "again")
     figures = RecalibrationSummary.read(model)
@@ -65,7 +65,7 @@ def test_a_base_that_is_stated_to_have_moved_is_identified_again():
     result = recalibrate(
         original_model(), rows_after_change(10, 2, base=motion), RecalibrationSettings(moved=("base",))
     )
-    assert result.summary.elsewhere == ("base",)
+    assert result.summary.relocated_frames == ("base",)
     T = transform_from_xyzrpy(torch.tensor(motion).double())
     before, after = (torch.from_numpy(one.bases[""][:3].copy()) for one in (original_model(), result.model))
     assert_close(after, T[:3, :3] @ before + T[:3, 3], atol=1e-3)
@@ -108,7 +108,7 @@ def test_rows_of_another_arm_are_not_trusted(tmp_path):
     result = recalibrate(original_model(), replace(rows, q=rows.q.flip(0)))
     assert [one.severity for one in result.diagnostics] == ["implausible"]
     assert not result.movements
-    assert result.summary.changed == NOT_TRUSTED
+    assert result.summary.change_sentence == NOT_TRUSTED
     with refused(AcceptanceError, file=tmp_path / "no"):
         result.save(tmp_path / "no")
     assert not (tmp_path / "no").exists()

@@ -252,7 +252,7 @@ def _exported(
             "program": str(request.program),
             "targets": len(corrected.statuses),
             "statuses": dict(Counter(status.name.lower() for _, status in corrected.statuses)),
-            "unreached_lines": [
+            "unreached": [
                 {"line": line, "status": status.name.lower()} for line, status in corrected.unreached_lines
             ],
             "branches": list(corrected.branches),

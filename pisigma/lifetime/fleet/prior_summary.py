@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.yaml_file import Section
+from pisigma.files.yaml_file import StoredFigures
 from pisigma.lifetime.fleet.prior import FleetPrior
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.model_posterior import FLEET_PRIOR
@@ -20,14 +21,14 @@ _SAME = 1e-6
 """Largest difference of the effects of parameters, relative to their sizes, that is due to rounding."""
 
 
-class ParameterErrorFigures(Section):
+class ParameterErrorFigures(StoredFigures):
     """Distribution of a parameter's error in the fleet.
 
     Attributes:
         name: name such as "theta_1".
         unit: "mm" or "deg".
         mean: mean error.
-        deviation: standard deviation between robots.
+        sigma: standard deviation between robots.
         in_a_sum: whether other parameters, base or tool move the tool of the nominal robot in the same way, so that
             mean and deviation are determined only together with theirs.
     """
@@ -35,20 +36,20 @@ class ParameterErrorFigures(Section):
     name: str
     unit: str
     mean: float
-    deviation: float
+    sigma: Annotated[float, Field(alias="deviation")]
     in_a_sum: bool = False
 
 
-class WeightSpreadFigures(Section):
+class WeightSpreadFigures(StoredFigures):
     """Standard deviation between robots of the weights of a feature.
 
     Attributes:
         group: name of the group, such as "harmonics 1 to 1".
-        deg: root mean square over the weights of the group [deg; lengths are divided by the reach].
+        sigma_deg: root mean square over the weights of the group [deg; lengths are divided by the reach].
     """
 
     group: str
-    deg: float
+    sigma_deg: Annotated[float, Field(alias="deg")]
 
 
 class FleetPriorSummary(AbstractSummary):
@@ -56,7 +57,7 @@ class FleetPriorSummary(AbstractSummary):
 
     Attributes:
         robots: number of robots that were used.
-        odd: ids of robots that were not used because they are inconsistent with the other robots.
+        inconsistent_robots: ids of robots that were not used because they are inconsistent with the other robots.
         refused: reasons, by id of the robot, why files cannot be read.
         remarks: remarks on the rows of the robots that were used, one sentence each.
         rows: number of rows of all robots.
@@ -67,7 +68,7 @@ class FleetPriorSummary(AbstractSummary):
     kinds = (FLEET_PRIOR,)
 
     robots: int
-    odd: tuple[str, ...]
+    inconsistent_robots: Annotated[tuple[str, ...], Field(alias="odd")]
     refused: dict[str, str] = Field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     rows: int
@@ -77,7 +78,10 @@ class FleetPriorSummary(AbstractSummary):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings, one sentence each."""
-        odd = (f"Robot '{name}' is inconsistent with the others and was not used." for name in self.odd)
+        odd = (
+            f"Robot '{name}' is inconsistent with the others and was not used."
+            for name in self.inconsistent_robots
+        )
         refused = (f"Robot '{name}' was not used: {reason}" for name, reason in self.refused.items())
         return (*odd, *refused, *self.remarks)
 
@@ -99,7 +103,7 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
         dependent = bool(in_a_sum[number])
         parameters.append(
-            ParameterErrorFigures(name=name, unit=unit, mean=mean, deviation=spread, in_a_sum=dependent)
+            ParameterErrorFigures(name=name, unit=unit, mean=mean, sigma=spread, in_a_sum=dependent)
         )
     weights, start, spectrum = deviation[population.geometric_count :], 0, []
     for feature in uncertainty.features:
@@ -108,10 +112,12 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         start += len(group)
         for number, what in enumerate(feature.group_names):
             size = float(chosen[group == number].square().mean().sqrt())
-            spectrum.append(WeightSpreadFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
+            spectrum.append(
+                WeightSpreadFigures(group=f"{feature.name}: {what}", sigma_deg=math.degrees(size))
+            )
     return FleetPriorSummary(
         robots=len(ids) - len(prior.inconsistent_robots),
-        odd=tuple(ids[number] for number in prior.inconsistent_robots),
+        inconsistent_robots=tuple(ids[number] for number in prior.inconsistent_robots),
         rows=prior.model.provenance.rows,
         parameters=tuple(parameters),
         spectrum=tuple(spectrum),

@@ -368,10 +368,8 @@ def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement,
 
 def _zeros(solved: _Solved) -> JointZeros:
     """Estimate the zeros of all joints together."""
-    evidence, noise_factor = (
-        solved.evidence.with_moved_groups(solved.moved_frames),
-        solved.explanation.noise_factor,
-    )
+    noise_factor = solved.explanation.noise_factor
+    evidence = solved.evidence.with_moved_groups(solved.moved_frames)
     shift, covariance = evidence.estimate_shift(_joints(solved), noise_factor)
     sensitivity, session_covariance = evidence.sensitivity_and_covariance(_joints(solved), noise_factor)
     return JointZeros(shift, covariance.diagonal().sqrt(), sensitivity, session_covariance)

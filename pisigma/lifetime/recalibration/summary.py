@@ -1,5 +1,9 @@
 """Figures of a recalibration, which appear on cards, in tables and in JSON, and are stored in the model folder."""
 
+from typing import Annotated
+
+from pydantic import Field
+
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
 from pisigma.lifetime.recalibration.movement import SummaryMovement
@@ -22,13 +26,13 @@ class RecalibrationSummary(AbstractSummary):
         date: date of the recalibration, such as "2026-11-22".
         rows: number of rows that were used.
         outliers: rows that were left out.
-        kept: candidate that was kept.
+        kept_candidate: candidate that was kept.
         verdict: sentence about the candidate that was kept, with the errors of all candidates.
-        left_out: number of rows that were held out in cross-validation and used in the comparison.
+        held_out_row_count: number of rows that were held out in cross-validation and used in the comparison.
         cross_validation: errors of held-out rows by candidate.
-        changed: sentence that states what moved.
-        moved: significant movements.
-        elsewhere: bases and tools that were moved since the parent was made.
+        change_sentence: sentence that states what moved.
+        movements: significant movements.
+        relocated_frames: bases and tools that were moved since the parent was made.
         effective_parameters: number of directions of the unknowns that the rows determine.
         noise: standard deviation of each sensor [m or rad]; a factor if the rows state it.
         warnings: warnings, one sentence each.
@@ -40,13 +44,13 @@ class RecalibrationSummary(AbstractSummary):
     date: str
     rows: int
     outliers: tuple[ContradictingRowFigures, ...] = ()
-    kept: Kept
+    kept_candidate: Annotated[Kept, Field(alias="kept")]
     verdict: str
-    left_out: int
+    held_out_row_count: Annotated[int, Field(alias="left_out")]
     cross_validation: dict[str, HeldOutFigures]
-    changed: str
-    moved: tuple[SummaryMovement, ...]
-    elsewhere: tuple[str, ...]
+    change_sentence: Annotated[str, Field(alias="changed")]
+    movements: Annotated[tuple[SummaryMovement, ...], Field(alias="moved")]
+    relocated_frames: Annotated[tuple[str, ...], Field(alias="elsewhere")]
     effective_parameters: float
     noise: dict[str, float]
     warnings: tuple[str, ...] = ()

@@ -1,15 +1,16 @@
 """Figures of several arms: bases relative to each other, shared objects, and whether the arms agree on these."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
 from pisigma.calibration.frames.shared_objects import TOUCH, Postures
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.files.yaml_file import Section
+from pisigma.files.yaml_file import Section, StoredFigures
 from pisigma.robot.se3 import xyzrpy_from_transform
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -17,12 +18,12 @@ Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
 
-class ArmBaseFigures(Section):
+class ArmBaseFigures(StoredFigures):
     """Base of an arm relative to the base of another arm.
 
     Attributes:
         arm: name of the arm.
-        in_base_of: name of the other arm.
+        other_arm: name of the other arm.
         x_mm: position of the base along x [mm].
         y_mm: position along y [mm].
         z_mm: position along z [mm].
@@ -37,7 +38,7 @@ class ArmBaseFigures(Section):
     """
 
     arm: str
-    in_base_of: str
+    other_arm: Annotated[str, Field(alias="in_base_of")]
     x_mm: float
     y_mm: float
     z_mm: float
@@ -102,7 +103,7 @@ class ModelFile(Section):
     sha256: str = ""
 
 
-class ArmsSummary(Section):
+class ArmsSummary(StoredFigures):
     """All figures of several arms, as in `frames.yaml`.
 
     Attributes:
@@ -112,9 +113,10 @@ class ArmsSummary(Section):
         tips: touching tips that no target of the rows is.
         misfit: sum of the squared differences between the arms in units of their standard deviations.
         redundancy: number of independent differences that the bases do not absorb.
-        probability: probability of a larger misfit of arms without faults.
+        misfit_probability: probability of a larger misfit of arms without faults.
         diagnostics: findings about objects on which the arms disagree.
-        sums: directions of the bases that are known only in a sum with parameters of a tool, one sentence each.
+        indeterminate_sums: directions of the bases that are known only in a sum with parameters of a tool, one sentence
+            each.
     """
 
     arms: tuple[ModelFile, ...]
@@ -122,14 +124,14 @@ class ArmsSummary(Section):
     shared: tuple[SharedFigures, ...]
     misfit: float
     redundancy: int
-    probability: float
+    misfit_probability: Annotated[float, Field(alias="probability")]
     tips: tuple[TipFigures, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
-    sums: tuple[str, ...] = ()
+    indeterminate_sums: Annotated[tuple[str, ...], Field(alias="sums")] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as JSON values, by name."""
-        return self.model_dump(mode="json")
+        return self.model_dump(mode="json", by_alias=True)
 
 
 def base_figures(
@@ -143,7 +145,7 @@ def base_figures(
     values = dict(zip(names, (xyzrpy_from_transform(T).numpy() * shown).tolist(), strict=True))
     return ArmBaseFigures(
         arm=bases.arms[second_arm].name,
-        in_base_of=bases.arms[first_arm].name,
+        other_arm=bases.arms[first_arm].name,
         standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
         covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
         tool_to_tool_mm=bases.tool_to_tool_deviation(first_arm, second_arm, postures) * 1e3,
@@ -207,7 +209,10 @@ def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
 
 
 def arms_summary(
-    bases: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...], sums: tuple[str, ...]
+    bases: ArmBases,
+    robots: tuple[str, ...],
+    postures: tuple[Postures, ...],
+    indeterminate_sums: tuple[str, ...],
 ) -> ArmsSummary:
     """Collect the figures of several arms.
 
@@ -215,7 +220,7 @@ def arms_summary(
         bases: the arms with their bases.
         robots: names of their robots.
         postures: postures of every arm.
-        sums: sentences of `sums_with_tool` of all arms.
+        indeterminate_sums: sentences of `sums_with_tool` of all arms.
     """
     names = [arm.name for arm in bases.arms]
     count = len(names)
@@ -236,8 +241,8 @@ def arms_summary(
         ),
         misfit=bases.conditioned.misfit,
         redundancy=bases.conditioned.redundancy,
-        probability=bases.probability,
+        misfit_probability=bases.probability,
         tips=tip_figures(bases),
         diagnostics=tuple(disagreement_diagnostic(bases, one) for one in bases.disagreements),
-        sums=sums,
+        indeterminate_sums=indeterminate_sums,
     )

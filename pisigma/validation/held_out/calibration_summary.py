@@ -7,15 +7,15 @@ value are None.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import JsonValue
+from pydantic import Field, JsonValue
 
 from pisigma.calibration.geometric.identifiability.observability import Observability
 from pisigma.calibration.geometric.outliers import Outlier
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
-from pisigma.files.yaml_file import Section
+from pisigma.files.yaml_file import Section, StoredFigures
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.validation.held_out.summary import AbstractSummary
@@ -23,13 +23,13 @@ from pisigma.validation.held_out.trained_calibrations import Result, geometric_r
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
 
-class NoiseFigures(Section):
+class NoiseFigures(StoredFigures):
     """Noise of one kind of sensor, estimated from the residuals.
 
     Attributes:
         sensor: kind of sensor, such as "position".
         values: number of measured values.
-        used_by_parameters: effective number of parameters estimated from them.
+        effective_parameters: effective number of parameters estimated from them.
         sigma_mm: standard deviation of one value [mm].
         sigma_deg: standard deviation of one angle [deg].
         factor_on_stated_sigma: factor on the standard deviations that the rows state.
@@ -37,7 +37,7 @@ class NoiseFigures(Section):
 
     sensor: str
     values: int | None = None
-    used_by_parameters: float | None = None
+    effective_parameters: Annotated[float | None, Field(alias="used_by_parameters")] = None
     sigma_mm: float | None = None
     sigma_deg: float | None = None
     factor_on_stated_sigma: float | None = None
@@ -87,14 +87,14 @@ class RedundancyFigures(Section):
     pairwise_kept: tuple[str, ...]
 
 
-class OutlierFigures(Section):
+class OutlierFigures(StoredFigures):
     """A row with less than half of the full weight.
 
     Attributes:
         row: index in the measurements, from 0.
         place: file and line.
         sensor: kind of sensor of the value.
-        deviations: length of the residual, in standard deviations of one value.
+        residual_in_sigmas: length of the residual, in standard deviations of one value.
         residual_mm: length of the residual [mm].
         residual_deg: angle of the residual, for an orientation [deg].
     """
@@ -102,29 +102,29 @@ class OutlierFigures(Section):
     row: int
     place: str
     sensor: str
-    deviations: float
+    residual_in_sigmas: Annotated[float, Field(alias="deviations")]
     residual_mm: float | None = None
     residual_deg: float | None = None
 
 
-class TrialFigures(Section):
+class TrialFigures(StoredFigures):
     """A joint correction that was tried; see `pisigma.calibration.hybrid.search.Trial`.
 
     Attributes:
         name: name of the trial, such as "gravity + series 56 + products (2, 2)".
         unknowns: number of parameters and weights.
         log_evidence: log evidence up to a constant of the data; None if it was not computed.
-        left_out: ratio of the held-out RMS error of training rows to that of the geometric calibration [1].
+        held_out_ratio: ratio of the held-out RMS error of training rows to that of the geometric calibration [1].
         seconds: duration [s].
-        kept: whether it was better than all previous trials.
+        is_improvement: whether it was better than all previous trials.
     """
 
     name: str
     unknowns: int
     log_evidence: float | None
-    left_out: float
+    held_out_ratio: Annotated[float, Field(alias="left_out")]
     seconds: float
-    kept: bool
+    is_improvement: Annotated[bool, Field(alias="kept")]
 
 
 class LearnedFigures(Section):
@@ -276,7 +276,7 @@ def summarise(result: Result) -> CalibrationSummary:
                 one.sigma,
                 one.unit,
                 values=one.values,
-                used_by_parameters=one.effective_parameters,
+                effective_parameters=one.effective_parameters,
             )
             for one in geometric.noise
         ),
@@ -312,7 +312,10 @@ def _outliers(outliers: Sequence[Outlier]) -> tuple[OutlierFigures, ...]:
     rows = []
     for outlier in outliers:
         unit, factor = SHOWN_UNITS[outlier.unit]
-        figures = {"deviations": outlier.residual_in_sigmas, f"residual_{unit}": outlier.residual * factor}
+        figures = {
+            "residual_in_sigmas": outlier.residual_in_sigmas,
+            f"residual_{unit}": outlier.residual * factor,
+        }
         rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
     return tuple(rows)
 
@@ -331,9 +334,9 @@ def _hybrid(result: HybridResult) -> HybridFigures:
             name=trial.name,
             unknowns=trial.unknowns,
             log_evidence=_or_none(trial.log_evidence),
-            left_out=trial.held_out_ratio,
+            held_out_ratio=trial.held_out_ratio,
             seconds=round(trial.seconds, 3),
-            kept=trial.kept,
+            is_improvement=trial.kept,
         )
         for trial in result.trials
     )

@@ -4,7 +4,11 @@ Cards, terminal tables and JSON are made from it, and a model folder stores it a
 and degrees.
 """
 
-from pisigma.files.yaml_file import Section
+from typing import Annotated
+
+from pydantic import Field
+
+from pisigma.files.yaml_file import Section, StoredFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
@@ -62,7 +66,7 @@ class PoseFigures(Section):
     refused: dict[str, int]
 
 
-class SizeFigures(Section):
+class SizeFigures(StoredFigures):
     """A network size that was tried.
 
     Attributes:
@@ -70,14 +74,14 @@ class SizeFigures(Section):
         harmonics: highest harmonic of a joint's value among the inputs [1/turn].
         unknowns: number of weights and biases per joint.
         rms_mm: RMS error of the tool over the validation poses [mm].
-        kept: whether this size was selected.
+        is_selected: whether this size was selected.
     """
 
     orders: tuple[int, ...]
     harmonics: int
     unknowns: int
     rms_mm: float
-    kept: bool
+    is_selected: Annotated[bool, Field(alias="kept")]
 
 
 class DistilledErrors(Section):

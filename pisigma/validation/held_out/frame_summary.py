@@ -1,12 +1,14 @@
 """Figures of a base, a tool or a hand-eye transform that was calibrated with the arm held fixed."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from pisigma.calibration.frames.frame_fit import FrameFit
 from pisigma.calibration.frames.misfit_causes import size_text
 from pisigma.estimation.alternatives import Cause
-from pisigma.files.yaml_file import Section
+from pisigma.files.yaml_file import StoredFigures
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.validation.held_out.calibration_summary import NoiseFigures, noise_figures
 from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures, contradicting_rows
@@ -14,7 +16,7 @@ from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 
 
-class CoordinateFigures(Section):
+class CoordinateFigures(StoredFigures):
     """A coordinate of a base or a tool.
 
     Attributes:
@@ -23,7 +25,8 @@ class CoordinateFigures(Section):
         nominal: value before the calibration.
         estimated: estimated value.
         standard_error: standard error of the estimate; None if the rows do not determine it.
-        by_noise: part of the standard error due to the noise of the rows, without the uncertainty of the arm.
+        standard_error_by_noise: part of the standard error due to the noise of the rows, without the uncertainty of the
+            arm.
     """
 
     name: str
@@ -31,25 +34,25 @@ class CoordinateFigures(Section):
     nominal: float
     estimated: float
     standard_error: float | None
-    by_noise: float | None
+    standard_error_by_noise: Annotated[float | None, Field(alias="by_noise")]
 
 
-class CauseFigures(Section):
+class CauseFigures(StoredFigures):
     """A possible cause of the residuals of a hand-eye calibration.
 
     Attributes:
         cause: "arm", "joint zeros", "joint noise", "camera" or "board".
         log_bayes_factor: log evidence with this cause alone, minus that with noise alone [nats].
-        share: share of the squared residuals, in units of their noise, that this cause alone explains.
+        explained_share: share of the squared residuals, in units of their noise, that this cause alone explains.
         size: most probable size of its errors, with units.
-        named: whether the evidence supports it.
+        is_supported: whether the evidence supports it.
     """
 
     cause: str
     log_bayes_factor: float
-    share: float
+    explained_share: Annotated[float, Field(alias="share")]
     size: str
-    named: bool
+    is_supported: Annotated[bool, Field(alias="named")]
 
 
 class FrameSummary(AbstractSummary):
@@ -107,7 +110,7 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
                 standard_error=math.sqrt(variances[number] + arm_variance[number]) * factor
                 if known
                 else None,
-                by_noise=math.sqrt(variances[number]) * factor if known else None,
+                standard_error_by_noise=math.sqrt(variances[number]) * factor if known else None,
             )
         )
     return tuple(figures)
@@ -132,9 +135,9 @@ def _cause_figures(cause: Cause) -> CauseFigures:
     return CauseFigures(
         cause=cause.name,
         log_bayes_factor=cause.log_bayes_factor,
-        share=cause.explained_share,
+        explained_share=cause.explained_share,
         size=size_text(cause),
-        named=cause.is_supported,
+        is_supported=cause.is_supported,
     )
 
 
@@ -177,7 +180,7 @@ def frame_summary(
                 one.sigma,
                 one.unit,
                 values=one.values,
-                used_by_parameters=one.effective_parameters,
+                effective_parameters=one.effective_parameters,
             )
             for one in result.noise
         ),

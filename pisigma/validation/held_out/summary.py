@@ -5,14 +5,14 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import ValidationError
 
 from pisigma.files.errors import ModelError
-from pisigma.files.yaml_file import Section
+from pisigma.files.yaml_file import StoredFigures
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 Summary = TypeVar("Summary", bound="AbstractSummary")
 
 
-class AbstractSummary(Section):
+class AbstractSummary(StoredFigures):
     """All figures of a model. Figures that do not exist are unset and omitted from JSON.
 
     Attributes:
@@ -27,7 +27,7 @@ class AbstractSummary(Section):
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures that are set as JSON values, by name."""
-        return self.model_dump(mode="json", exclude_unset=True)
+        return self.model_dump(mode="json", exclude_unset=True, by_alias=True)
 
     def with_figures(self: Summary, **figures: object) -> Summary:
         """Return a copy with further figures; figures that are None are omitted."""

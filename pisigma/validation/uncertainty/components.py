@@ -172,6 +172,6 @@ def _noise(model: CalibratedModel) -> NoiseFigures | None:
 def _freedom(model: CalibratedModel) -> float | None:
     """Return the degrees of freedom of the residuals, `n - p`; None if the model does not store them."""
     noise = _noise(model)
-    if noise is None or noise.values is None or noise.used_by_parameters is None:
+    if noise is None or noise.values is None or noise.effective_parameters is None:
         return None
-    return max(noise.values - noise.used_by_parameters, 1.0)
+    return max(noise.values - noise.effective_parameters, 1.0)

@@ -95,7 +95,7 @@ class ArmsCalibration:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences on values that are known only as sums of bases and tools, and warnings with names of arms."""
-        return self.summary.sums + tuple(
+        return self.summary.indeterminate_sums + tuple(
             f"{name}: {sentence}" for name, one in self.calibrations.items() for sentence in one.warnings
         )
 

@@ -150,7 +150,7 @@ def _poses_in_first(summary: ArmsSummary) -> dict[str, Float64[Tensor, "4 4"]]:
     first = summary.arms[0].name
     poses = {first: torch.eye(4, dtype=torch.float64)}
     for one in summary.bases:
-        if one.in_base_of == first:
+        if one.other_arm == first:
             angles = np.deg2rad([one.roll_deg, one.pitch_deg, one.yaw_deg])
             xyzrpy = np.concatenate([np.array([one.x_mm, one.y_mm, one.z_mm]) / 1e3, angles])
             poses[one.arm] = transform_from_xyzrpy(torch.from_numpy(xyzrpy))

@@ -275,9 +275,8 @@ class Cell:
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
-            self.history.add(
-                monitoring_check_entry(found, entry, one, seen, self.file.settings_of_step("recalibrate"))
-            )
+            stated = self.file.settings_of_step("recalibrate")
+            self.history.add(monitoring_check_entry(found, entry, one, seen, stated))
         assert found is not None  # there is a session
         return replace(found, warnings=(*warnings, *found.warnings))
 
@@ -333,7 +332,7 @@ class Cell:
         path = self._saved(result, accept_implausible)
         remark, (p95, rms) = result.summary.verdict, result.position_errors_mm
         entry = model_entry((), started, path, [chosen], remark, result, parent)
-        of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
+        of = ("recalibrate", entry.name, chosen.name, result.summary.kept_candidate, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
             events = unrecorded_changes(result, chosen, seen.changed_frames, self.sessions.valid_sessions())

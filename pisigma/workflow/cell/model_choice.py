@@ -168,7 +168,10 @@ def unrecorded_changes(
     """
     if [one.day for one in valid].count(session.day) > 1:
         return []
-    moved = {one.split()[0] for one in (*result.summary.elsewhere, *(part.what for part in result.movements))}
+    moved = {
+        one.split()[0]
+        for one in (*result.summary.relocated_frames, *(part.what for part in result.movements))
+    }
     kinds: dict[str, EventKind] = {"base": "instrument", "tool": "tool"}
     note = f"found by the recalibration with session '{session.name}'"
     return [

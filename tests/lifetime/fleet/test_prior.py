@@ -37,7 +37,7 @@ def rms(errors):
 def test_an_inconsistent_robot_is_named_and_excluded(prior):
     assert prior.inconsistent_robots == (ROBOTS - 1,)
     summary = summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)])
-    assert (summary.robots, summary.odd) == (ROBOTS - 1, ("r7",))
+    assert (summary.robots, summary.inconsistent_robots) == (ROBOTS - 1, ("r7",))
     assert "r7" in summary.warnings[0]
 
 
@@ -76,7 +76,8 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
     assert np.array_equal(begun.model.calibrated.dh, without.model.calibrated.dh)
     assert fewer.candidate_choice.kept != "scratch"
     assert (
-        fewer.summary.changed == FleetConsistency.from_rows(prior.model, few.select(torch.arange(8))).sentence
+        fewer.summary.change_sentence
+        == FleetConsistency.from_rows(prior.model, few.select(torch.arange(8))).sentence
     )
     # the prior is widened until it contains this robot
     root = CovarianceRoot(fewer.adaptation.problem.posterior.covariance_root)

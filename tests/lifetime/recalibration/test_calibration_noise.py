@@ -60,7 +60,7 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
     assert all(session.observable)
     assert_close(session.movements[0].shift, MOVED_DEG, atol=0.005)
     assert [one.what for one in recalibrated.movements] == ["joint 3"]
-    assert recalibrated.summary.kept == "recalibrated"
+    assert recalibrated.summary.kept_candidate == "recalibrated"
     found = recalibrated.model.uncertainty.noise
     assert found.is_factor("position") == (of_rows == "stated")
     assert_close(found.standard_deviation("position"), SIGMA, rtol=0.5)

@@ -90,9 +90,8 @@ class CalibrationSetup:
 
     def corner_sensor(self, rows: Measurements) -> CornerSensor | None:
         """Return the images in the rows of the problem, with the weights that these state; None without images."""
-        return CornerSensor.build(
-            self.reference_frames.sensor_rows(rows, self.problem.frame, self.problem.target)
-        )
+        problem, frames = self.problem, self.reference_frames
+        return CornerSensor.build(frames.sensor_rows(rows, problem.frame, problem.target))
 
 
 @dataclass(frozen=True)
@@ -175,11 +174,10 @@ def setup_from_guess(
     unknown_frames = {
         own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
     }
-    reference_frames, start = _anchored(space, initial_guess, options, unknown_frames)
+    reference, start = _anchored(space, initial_guess, options, unknown_frames)
     if dh is not None:
         start[: space.arm_parameter_count] = torch.from_numpy(dh.flatten())
-    start = start.to(device)
-    sensors = build_sensors(reference_frames.sensor_rows(measurements, frame, target))
+    start, sensors = start.to(device), build_sensors(reference.sensor_rows(measurements, frame, target))
     distances = SocketDistanceSensor.assign_distances(
         measurements, options.socket_distances, options.socket_sigma
     )
@@ -206,14 +204,7 @@ def setup_from_guess(
         for index in initial_guess.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
     ]
     setup = CalibrationSetup(
-        problem,
-        start,
-        reference_frames,
-        rows,
-        unknown_frames,
-        free,
-        measurements,
-        options.joint_repeatability,
+        problem, start, reference, rows, unknown_frames, free, measurements, options.joint_repeatability
     )
     return setup.weighted_at(start)
 
@@ -259,28 +250,22 @@ def _anchored(
 ) -> tuple[ReferenceFrames, Float64[Tensor, " parameters"]]:
     """Return the anchors, and the start relative to them: the identity for free bases and free tool rotations."""
     bases, tools = guessed.bases.copy(), guessed.tools.copy()
-    reference_frames = ReferenceFrames(
+    reference = ReferenceFrames(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
     )
     if options.free_base:
-        reference_frames = ReferenceFrames(
-            transform_from_xyzrpy(torch.from_numpy(bases)), reference_frames.tools
-        )
+        reference = ReferenceFrames(transform_from_xyzrpy(torch.from_numpy(bases)), reference.tools)
         bases = np.zeros_like(bases)
     if options.free_tool:
-        reference_frames = ReferenceFrames(
-            reference_frames.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:]))
-        )
+        reference = ReferenceFrames(reference.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
         tools[:, 3:] = 0
     unknowns = {
         own.name: _moved(
-            invert(reference_frames.bases)[unknown_frames[own.name]],
-            guessed.unknowns[own.name],
-            own.has_point,
+            invert(reference.bases)[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point
         ).numpy()
         for own in space.unknowns
     }
-    return reference_frames, space.values(bases, tools, unknowns)
+    return reference, space.values(bases, tools, unknowns)
 
 
 def _moved(
