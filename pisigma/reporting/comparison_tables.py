@@ -107,7 +107,8 @@ def _error_lines(comparison: ModelComparison, full: bool) -> _Lines:
             for where in ("inside", "outside"):
                 cells = [
                     _domain(
-                        getattr(model.quantities[quantity], where), getattr(model, f"rows_{where}_domain")
+                        getattr(model.quantities[quantity], f"{where}_statistics"),
+                        getattr(model, f"rows_{where}_domain"),
                     )
                     for model in models
                 ]

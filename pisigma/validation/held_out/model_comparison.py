@@ -190,7 +190,9 @@ class ModelFigures:
         }
         for where, rows in (("inside", self.rows_inside_domain), ("outside", self.rows_outside_domain)):
             if rows is not None:
-                values[f"{where}_domain"] = {"rows": rows, **_with_units(errors, where)} if rows else None
+                values[f"{where}_domain"] = (
+                    {"rows": rows, **_with_units(errors, f"{where}_statistics")} if rows else None
+                )
         if self.position.difference is not None:
             values["difference_to_first"] = {
                 quantity: one.difference.to_json(one.unit)
