@@ -208,9 +208,9 @@ def arms_text(
         for name, one in calibrations.items()
     ]
     agreement = (
-        f"The RMS difference between the arms is {math.sqrt(summary.misfit / summary.redundancy):.2g} standard "
-        f"deviations ({summary.redundancy} differences)."
-        if summary.redundancy
+        f"The RMS difference between the arms is {math.sqrt(summary.misfit / summary.degrees_of_freedom):.2g} standard "
+        f"deviations ({summary.degrees_of_freedom} differences)."
+        if summary.degrees_of_freedom
         else "The arms share too little to check their bases; share a second frame, or four sockets."
     )
     return ResultText(

@@ -97,7 +97,7 @@ def test_every_arm_has_a_model_and_the_file_has_their_bases(calibrated):
     assert_close(
         covariance.diagonal().sqrt(), torch.tensor(base.standard_errors, dtype=torch.float64), rtol=1e-9
     )
-    assert (written.redundancy, len(written.diagnostics), written.indeterminate_sums) == (6, 0, ())
+    assert (written.degrees_of_freedom, len(written.diagnostics), written.indeterminate_sums) == (6, 0, ())
 
 
 def test_frame_that_moved_between_the_arms_is_not_trusted(disagreeing, tmp_path):

@@ -211,5 +211,5 @@ def uncertainty_of(result: CalibrationResult) -> PositionUncertainty:
     """Return the uncertainty of a geometric calibration."""
     solved = result.solved
     return PositionUncertainty(
-        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.covariance_root), prior_scale=1.0
+        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.covariance_root), variance_factor=1.0
     )

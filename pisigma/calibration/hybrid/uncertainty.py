@@ -61,7 +61,7 @@ class PositionUncertainty:
         features: features of the weights.
         covariance_root: root `R` of `C = R R^T` for all parameters of the space (0 for parameters that were not
             free), followed by all weights, scaled so that predicted and observed held-out errors agree.
-        prior_scale: factor on the variances that results from this scaling.
+        variance_factor: factor on the variances that results from this scaling.
         noise: noise of the sensors; empty in folders of earlier versions.
     """
 
@@ -69,7 +69,7 @@ class PositionUncertainty:
     geometry: IdentifiedGeometry
     features: tuple[AbstractFeature, ...]
     covariance_root: CovarianceRoot
-    prior_scale: float
+    variance_factor: float
     noise: CalibrationNoise = field(default_factory=CalibrationNoise)
 
     @property
@@ -210,14 +210,14 @@ def position_uncertainty(
         missed = fit.held_out_errors_refitted(posterior, folds, updates)
     else:
         missed = held_out_errors or fit.held_out_errors(posterior, folds)
-    prior_scale = held_out_scale(missed)
+    variance_factor = held_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
-    root = root.with_columns(prior_size_columns(posterior, root), prior_scale**0.5, change)
+    root = root.with_columns(prior_size_columns(posterior, root), variance_factor**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     setup = geometry.setup
     if setup is not None and setup.joint_repeatability and "corner" in value:
         factor = corner_sigma_factor(setup.measurements, value["corner"])
         value[JOINT] = factor * setup.joint_repeatability
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
-    return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)
+    return PositionUncertainty(design.problem.space, geometry, design.features, root, variance_factor, noise)

@@ -237,7 +237,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
     root = CovarianceRoot(adaptation.covariance_root)
     space = adaptation.problem.design.problem.space
     noise = known.noise.updated(adaptation.noise)
-    uncertainty = PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise)
+    uncertainty = PositionUncertainty(space, geometry, known.features, root, known.variance_factor, noise)
     return replace(
         model,
         kind=KIND,

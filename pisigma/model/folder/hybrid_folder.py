@@ -69,7 +69,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "free": [row for row in known.uncertain_unknowns if row < len(known.space.parameters)],
             "rounded": known.covariance_root.rounded is not None,
             "features": [chosen.name for chosen in known.features],
-            "prior_scale": known.prior_scale,
+            "prior_scale": known.variance_factor,
             "noise": dict(known.noise.value),
             "stated_noise": None
             if known.noise.median_stated_sigma is None
@@ -309,7 +309,7 @@ def _uncertainty(
     features = _weighted(known, None if hybrid is None else hybrid.correction)
     noise = CalibrationNoise(known.noise, known.stated_noise)
     root = _root(known, tensors, free, count)
-    return PositionUncertainty(space, geometry, features, root, known.prior_scale, noise)
+    return PositionUncertainty(space, geometry, features, root, known.variance_factor, noise)
 
 
 def _root(

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator
 
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import DESCRIPTION, read_model_file
-from pisigma.files.yaml_file import Section, parse_yaml
+from pisigma.files.yaml_file import Section, StoredFigures, parse_yaml
 from pisigma.files.yaml_writing import yaml_text
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
@@ -82,7 +82,7 @@ class UnknownsSection(Section):
     units: dict[str, OtherUnit] = Field(default_factory=dict)
 
 
-class UncertaintySection(Section):
+class UncertaintySection(StoredFigures):
     """Section of the unknowns to which the rows of the covariance root in the weights file belong, in order.
 
     Attributes:
@@ -94,7 +94,7 @@ class UncertaintySection(Section):
         rounded: whether the root is stored in whole numbers, see `pisigma.estimation.rounded_root.RoundedRoot`.
         features: names of the features whose weights follow: the features of the learned part, and `products` for
             the products of inputs in its product units.
-        prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
+        variance_factor: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
         noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise`.
         stated_noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise.median_stated_sigma`.
     """
@@ -104,7 +104,7 @@ class UncertaintySection(Section):
     free: tuple[Annotated[int, Field(ge=0)], ...]
     rounded: bool = False
     features: Annotated[tuple[str, ...], Field(max_length=_MAX_UNITS)]
-    prior_scale: Annotated[float, Field(gt=0)]
+    variance_factor: Annotated[float, Field(gt=0, alias="prior_scale")]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
     stated_noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] | None = None
 

@@ -269,7 +269,7 @@ def _cells(status: FleetStatus, cells: Sequence[CellStatus], folder: Path) -> Ta
 def comparison_page(
     models: Mapping[str, CalibratedModel],
     parameters: ParameterDifferences,
-    displacements: Mapping[str, Displacement],
+    tool_displacements: Mapping[str, Displacement],
     rows: ModelComparison | None,
     sentences_and_warnings: tuple[Sequence[str], Sequence[str]],
 ) -> str:
@@ -278,7 +278,7 @@ def comparison_page(
     Args:
         models: two models by name.
         parameters: differences of the parameters.
-        displacements: displacements of the tool, by description of the poses.
+        tool_displacements: displacements of the tool, by description of the poses.
         rows: errors of both models on rows; None if none were given.
         sentences_and_warnings: sentences of the result, and warnings.
     """
@@ -292,8 +292,8 @@ def comparison_page(
         parameters=difference_table(parameters, (first, second)),
         differs=bool(parameters.differing),
         level=f"{parameters.significance_level:.2g}",
-        maps=[draw_displacement(what, one) for what, one in displacements.items()],
-        displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
+        maps=[draw_displacement(what, one) for what, one in tool_displacements.items()],
+        displacements=pose_rows({what: one.errors.figures for what, one in tool_displacements.items()}),
         rows=() if rows is None else comparison_tables(rows, "the rows", _PAGE_WIDTH),
         sentences=sentences,
         warnings=warnings,

@@ -112,7 +112,7 @@ class ArmsSummary(StoredFigures):
         shared: objects that the arms share.
         tips: touching tips that no target of the rows is.
         misfit: sum of the squared differences between the arms in units of their standard deviations.
-        redundancy: number of independent differences that the bases do not absorb.
+        degrees_of_freedom: number of independent differences that the bases do not absorb.
         misfit_probability: probability of a larger misfit of arms without faults.
         diagnostics: findings about objects on which the arms disagree.
         indeterminate_sums: directions of the bases that are known only in a sum with parameters of a tool, one sentence
@@ -123,7 +123,7 @@ class ArmsSummary(StoredFigures):
     bases: tuple[ArmBaseFigures, ...]
     shared: tuple[SharedFigures, ...]
     misfit: float
-    redundancy: int
+    degrees_of_freedom: Annotated[int, Field(alias="redundancy")]
     misfit_probability: Annotated[float, Field(alias="probability")]
     tips: tuple[TipFigures, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -240,7 +240,7 @@ def arms_summary(
             for one, distance in zip(bases.shared, bases.max_distances, strict=True)
         ),
         misfit=bases.conditioned.misfit,
-        redundancy=bases.conditioned.redundancy,
+        degrees_of_freedom=bases.conditioned.redundancy,
         misfit_probability=bases.probability,
         tips=tip_figures(bases),
         diagnostics=tuple(disagreement_diagnostic(bases, one) for one in bases.disagreements),

@@ -127,7 +127,7 @@ class TrialFigures(StoredFigures):
     is_improvement: Annotated[bool, Field(alias="kept")]
 
 
-class LearnedFigures(Section):
+class LearnedFigures(StoredFigures):
     """The joint correction that was kept.
 
     Attributes:
@@ -137,7 +137,7 @@ class LearnedFigures(Section):
         effective_parameters: effective number of parameters; the others are determined by the prior.
         linearisations: iterations of the fit.
         noise: noise per sensor.
-        prior_scale: factor on predicted variances that fits the held-out errors.
+        variance_factor: factor on predicted variances that fits the held-out errors.
     """
 
     features: tuple[dict[str, JsonValue], ...]
@@ -146,7 +146,7 @@ class LearnedFigures(Section):
     effective_parameters: float
     linearisations: int
     noise: tuple[NoiseFigures, ...]
-    prior_scale: float
+    variance_factor: Annotated[float, Field(alias="prior_scale")]
 
 
 class HybridFigures(Section):
@@ -359,7 +359,7 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
             for sensor, sigma in learned.noise.items()
             if sensor in units
         ),
-        prior_scale=result.uncertainty.prior_scale,
+        variance_factor=result.uncertainty.variance_factor,
     )
 
 

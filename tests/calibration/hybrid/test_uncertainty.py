@@ -171,7 +171,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))
     draws = torch.linalg.cholesky(C) @ normal(len(C), 4000, seed=8)
-    drawn = (X @ draws).std(-1) * found.prior_scale**0.5
+    drawn = (X @ draws).std(-1) * found.variance_factor**0.5
     of_rows = arm.setup.measurements.select(values.row)
     got = found.sigma(of_rows, correction)
     # Drawn along the axes of the problem, told along those of the frame: the length is the same.
@@ -186,16 +186,16 @@ def test_more_rows_reduce_the_widening_which_is_at_least_one() -> None:
         found, _, correction = uncertainty(own)
         test = tracker_data(robot, random_joints(robot, 200, 3))
         deviations.append(float(found.sigma(test, correction).mean()))
-        assert 1.0 <= found.prior_scale < 3.0
+        assert 1.0 <= found.variance_factor < 3.0
     assert 0.3 < deviations[1] / deviations[0] < 0.75
 
 
 def test_sizes_and_noise_of_many_groups_are_those_of_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.load("rb5")
     own = linearised(robot, tracker_data(robot, random_joints(robot, 80, 2), noise=3e-5))
-    folds = uncertainty(own)[0].prior_scale
+    folds = uncertainty(own)[0].variance_factor
     monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.FEW_GROUPS", 10)
-    single = uncertainty(own)[0].prior_scale
+    single = uncertainty(own)[0].variance_factor
     assert 1.0 <= single < 1.5 * folds
     monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.CHUNK", 3)
     test = tracker_data(robot, random_joints(robot, 10, 3))

@@ -107,7 +107,7 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     assert without_remarks(upgraded.metrics) == without_remarks(model.metrics)
     kept = replace(model, metrics=model.metrics | {"parameters": upgraded.metrics["parameters"]})
     assert CalibrationSummary.read(upgraded) == CalibrationSummary.read(kept)
-    assert upgraded.uncertainty.prior_scale == model.uncertainty.prior_scale
+    assert upgraded.uncertainty.variance_factor == model.uncertainty.variance_factor
     assert (tmp_path / "arm" / "model.safetensors").read_bytes() == files["model.safetensors"]
     assert (tmp_path / "arm" / "README.md").read_text() == CARD.format("the correction is an extrapolation")
     assert (tmp_path / "arm" / "compiled.npz").read_bytes() != files["compiled.npz"]

@@ -79,7 +79,7 @@ def test_frames_state_one_base_and_the_shared_joints(folder):
     assert [(one.kind, one.name) for one in written.shared] == [("joint", one) for one in TORSO] + [
         ("frame", "hall")
     ]
-    assert (written.redundancy, written.diagnostics) == (8, ())
+    assert (written.degrees_of_freedom, written.diagnostics) == (8, ())
 
 
 def test_nothing_is_named_if_nothing_moved(folder, nominal):
