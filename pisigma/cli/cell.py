@@ -220,8 +220,8 @@ def event(
     export: Annotated[
         Path | None,
         typer.Option(
-            help="With controller, file written by `pisigma export CELL` that the controller uses from this day, "
-            "or none."
+            help="For the event controller: file written by `pisigma export CELL` that the controller uses from "
+            "that day on, or none."
         ),
     ] = None,
     as_json: AsJson = False,

@@ -24,7 +24,7 @@ Read = Annotated[
 Like = Annotated[
     str | None,
     typer.Option(
-        help="With --read, the nominal robot of the controller.",
+        help="With --read, the nominal robot to which the file applies.",
         autocompletion=complete_robot,
     ),
 ]

@@ -1,1 +1,1 @@
-"""Read and write files, with inputs of limited size, outputs that are complete or absent, and located errors."""
+"""Read and write files: inputs are limited in size, outputs are complete or absent, and errors state their place."""

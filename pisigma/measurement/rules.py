@@ -345,7 +345,10 @@ def group_faults(
                 yield (
                     row,
                     Fault(
-                        problem, labels("frame"), value=frame[row], remedy="use another name in each frame"
+                        problem,
+                        labels("frame"),
+                        value=frame[row],
+                        remedy="use a different name in each frame",
                     ),
                 )
     for name, rows in _groups(data.text("anchor")).items():

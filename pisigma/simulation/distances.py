@@ -135,7 +135,7 @@ class SimulatedDistances(AbstractCommandedJoints):
 
 
 class SimulatedPairs(AbstractCommandedJoints):
-    """Section of a recipe for distances between pairs of poses: the first and the second pose, and so on.
+    """Section of a recipe for distances between pairs of poses: poses 1 and 2, poses 3 and 4, and so on.
 
     Attributes:
         kind: "pairs".

@@ -126,7 +126,7 @@ class CellScene:
             if found is not None:
                 top, note = (
                     round_up(float(found[1].p95.max())),
-                    f"Model {found[0]}: 95 % of the position errors are smaller.",
+                    f"Model {found[0]}: 95 % of the position errors are smaller than the value of the colour.",
                 )
             self._legend.content = str(self._text.legend("predicted error", top, RAMP, note))
             if self._scene is not None:

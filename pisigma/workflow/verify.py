@@ -59,7 +59,7 @@ _STARTS: dict[Verdict, str] = {
     "better": "The corrected model explains these measurements better than the nominal robot",
     "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
     "undecided": "These measurements do not show whether the corrected model or the nominal robot is more accurate",
-    "implausible": f"{_NOTHING_SHOWN}, because their errors are too large to be those of a calibration",
+    "implausible": f"{_NOTHING_SHOWN}, because their errors are too large for a calibrated robot",
 }
 
 

@@ -147,7 +147,7 @@ class ArmPosterior:
     def positions_in_base(
         self, postures: Postures, target: str | None = None, tip: Float64[Tensor, " 3"] | None = None
     ) -> tuple[Float64[Tensor, "postures 4 4"], Float64[Tensor, "postures 3 unknowns"]]:
-        """Return poses of a tool in the base of the arm, and the derivatives of its positions.
+        """Return poses of a tool in the base frame of the arm, and the derivatives of its positions.
 
         Args:
             postures: the postures.

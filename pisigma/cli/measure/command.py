@@ -1,4 +1,4 @@
-"""`pisigma measure`: follow the rows that are measured with a plan."""
+"""`pisigma measure`: check rows as they are measured according to a plan, and recommend the next pose."""
 
 import sys
 import threading
@@ -127,7 +127,7 @@ def measure(
     view: View = False,
     as_json: AsJson = False,
 ) -> None:
-    """Follow the rows measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
+    """Check rows as they are measured: wrong rows, the next pose of the plan, the accuracy, and when to stop.
 
     Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: if the remaining poses are planned
     again, they are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end.

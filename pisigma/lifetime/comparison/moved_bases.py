@@ -135,7 +135,7 @@ class MovedBases:
 
 
 def find_moved_bases(arms: Sequence[RemeasuredArm]) -> MovedBases:
-    """Find the arm's base or the frame that was moved since the arms were calibrated.
+    """Find the arm's base or the frame that has been moved since the arms were calibrated.
 
     The current bases are fitted with the arms as calibrated. Errors of an arm shift its base equally before and now, so
     they cancel, which the covariance takes into account. Under every hypothesis, one body moved by an unknown rigid

@@ -86,7 +86,7 @@ class Session:
             measured.
         error_score: RMS of the errors divided by their standard deviations; about 1 if nothing changed.
         values: number of measured values.
-        relocated_frames: names of bases and tools that were moved since the model was made.
+        relocated_frames: names of bases and tools that have been moved since the model was made.
         observable: whether the rows determine the zero of each joint.
         outliers: file and line of rows that are not used because they contradict the other rows under any movement.
         score_ratio: for images, whose poses have more noise than error, RMS ratio of values to their standard
@@ -175,7 +175,7 @@ def judge_session(
         model: the model.
         posterior: posterior of the model.
         rows: rows of one session, frames and targets by the names of the model.
-        relocated: bases and tools that were moved since the model was made; None to find them by evidence.
+        relocated: bases and tools that have been moved since the model was made; None to find them by evidence.
 
     Returns:
         The result of the session, and the zeros of all joints for charts.

@@ -120,7 +120,7 @@ def choose_candidate(
     Args:
         model: the model that is recalibrated.
         adaptation: adaptation of the model to all rows.
-        relocated: bases and tools that were moved since the model was made.
+        relocated: bases and tools that have been moved since the model was made.
         rows: new rows, frames and targets by the names of the model.
         calibrator: calibrator for the calibration from scratch.
         progress: callback that is called with the fold that is being predicted.

@@ -117,7 +117,7 @@ def recalibration_problem(
         model: the model.
         posterior: posterior of the model.
         rows: new rows, frames and targets by the names of the model.
-        relocated: bases and tools that were moved since the model was made; those that the model lacks need not be
+        relocated: bases and tools that have been moved since the model was made; those that the model lacks need not be
             named.
 
     Raises:

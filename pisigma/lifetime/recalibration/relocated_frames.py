@@ -1,4 +1,4 @@
-"""Find the bases and tools that were moved since a model was made, by the evidence of new rows."""
+"""Find the bases and tools that have been moved since a model was made, by the evidence of new rows."""
 
 from collections.abc import Set
 from contextlib import suppress

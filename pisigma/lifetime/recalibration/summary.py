@@ -32,7 +32,7 @@ class RecalibrationSummary(AbstractSummary):
         cross_validation: errors of held-out rows by candidate.
         change_sentence: sentence that states what moved.
         movements: significant movements.
-        relocated_frames: bases and tools that were moved since the parent was made.
+        relocated_frames: bases and tools that have been moved since the parent was made.
         effective_parameters: number of directions of the unknowns that the rows determine.
         noise: standard deviation of each sensor [m or rad]; a factor if the rows state it.
         warnings: warnings, one sentence each.

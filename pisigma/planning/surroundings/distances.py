@@ -5,7 +5,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 _MIN_SQUARED_LENGTH = 1e-18
-"""Squared length below which a segment is a point [m²]."""
+"""Squared length below which a segment is treated as a point [m²]."""
 
 Segments = Float64[Tensor, "*#batch 2 3"]
 """Both ends of line segments [m]."""

@@ -134,7 +134,7 @@ def select_far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tens
 
 
 class CornerNoise(Section):
-    """Normal noise of corners, and of the robot's pose from image to image.
+    """Normally distributed noise of the corners, and of the robot's pose from image to image.
 
     Attributes:
         corner_px: standard deviation of u and v of every corner [px].

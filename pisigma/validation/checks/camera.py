@@ -154,10 +154,10 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnost
     ]
     yield _warning(
         "camera_limits",
-        f"The camera limits this calibration: its images scatter by {ratio:.2f} times what their corners and the "
-        f"repeatability explain, and the predicted standard deviation of a position is {total * 1e3:.2g} mm RMS "
-        f"over the joint space{', ' + ' and '.join(parts) if parts else ''}. More images, a larger or nearer board "
-        "and more pixels improve it.",
+        f"The camera limits this calibration: the scatter of its images is {ratio:.2f} times what the noise of the "
+        "corners and the repeatability explain, and the predicted standard deviation of a position is "
+        f"{total * 1e3:.2g} mm RMS over the joint space{', ' + ' and '.join(parts) if parts else ''}. More images, "
+        "a larger or closer board, or more pixels would reduce the error.",
         scatter=float(ratio),
         predicted_mm=total * 1e3,
         **{f"share_{what.split()[-1]}": share for what, share in shares.items()},

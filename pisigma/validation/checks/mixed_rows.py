@@ -37,7 +37,7 @@ AGREES = 3.5
 _APART = 2.0
 """Multiple of the limit `AGREES` above which a row belongs to another setup."""
 _FAR_APART = 6.0
-"""Smallest ratio of the median errors of both groups."""
+"""Smallest ratio of the median errors of two groups at which they are separate."""
 _BETWEEN = 0.15
 """Largest share of the rows that may be neither near nor far."""
 DRAWS, _SAMPLE, _REFITS = 100, 4, 2

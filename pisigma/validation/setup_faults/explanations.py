@@ -54,8 +54,8 @@ _MIN_TURN = 0.01
 _MOVED = {
     "frame": (
         "base",
-        "the robot or the sensor was moved since the model was made; run again with --fit-frame, or recalibrate with "
-        "--moved base",
+        "the robot or the sensor has been moved since the model was made; run again with --fit-frame, or "
+        "recalibrate with --moved base",
     ),
     "tool": (
         "tool",

@@ -191,7 +191,7 @@ class Hypothesis:
 def shifted_rows(
     robot: Robot, rows: Measurements, row_indices: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Yield hypotheses with joint values or orientations shifted by rows, in all rows or on one side of a row.
+    """Yield hypotheses that joint values or orientations are shifted by rows, everywhere or only on one side of a row.
 
     Args:
         robot: the nominal robot.

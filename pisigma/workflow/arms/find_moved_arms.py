@@ -115,7 +115,7 @@ def find_moved_arms(
     data: Mapping[str, Measurements | MeasurementFiles],
     cameras: Mapping[str, CameraFiles] | None = None,
 ) -> ArmsMovement:
-    """Find the base or shared frame that was moved since the arms were calibrated, see `find_moved_bases`.
+    """Find the base or shared frame that has been moved since the arms were calibrated, see `find_moved_bases`.
 
     Args:
         folder: folder with `frames.yaml` and the models of the arms, as `calibrate_arms` wrote it.

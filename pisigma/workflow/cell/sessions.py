@@ -322,7 +322,7 @@ class Sessions:
         return rows
 
     def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> RowsWithModelNames:
-        """Return rows with a model's names of frame and target, and the parts that were moved since it was made.
+        """Return rows with a model's names of frame and target, and the parts that have been moved since it was made.
 
         Args:
             model: the model.

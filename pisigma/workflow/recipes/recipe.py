@@ -66,7 +66,8 @@ class SingularRows(Section):
     """Treatment of training rows near a singularity, where joint differences become arbitrarily large.
 
     Attributes:
-        rule: "keep" all rows, or "leave_out" rows whose smallest singular value is below `below`.
+        rule: "keep" all rows, or "leave_out" rows at which the smallest singular value of the
+            Jacobian is less than `below`.
         below: limit on the smallest singular value of the Jacobian, whose translations are divided by the
             characteristic length.
     """

@@ -98,12 +98,12 @@ class CalibrationSettings:
         model: kind of calibration: hybrid (geometry and, if the data support it, a joint correction) or geometric.
         folds: number of folds of the cross-validation (0: none). None: 5, or one per placement.
         hold_out: fraction of the rows to hold out once, instead of a cross-validation.
-        split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows of equal joint
+        split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows with equal joint
             values always stay together.
         repeats: number of repeats of the cross-validation. None: 200 divided by the number of distinct joint
             configurations, but at least 1 and at most 10.
         jobs: number of processes that calibrate in parallel, for all rows and for each fold. Each uses one thread.
-            None: threads of one process.
+            None: one process with several threads.
         seed: random seed of the split and of the choice of training rows.
         train_rows: number of randomly chosen rows to calibrate with, also in each fold. None: all.
         free: parameters to identify: identifiable, joint_offsets, or names such as a_2,theta_3.

@@ -1,4 +1,4 @@
-"""Settings of the monitoring of a robot."""
+"""Settings for monitoring a robot."""
 
 from dataclasses import dataclass
 from operator import not_
@@ -13,7 +13,7 @@ from pisigma.workflow.settings.recalibration import Moved, RecalibrationSettings
 
 @dataclass(frozen=True)
 class MonitorSettings:
-    """Settings of the monitoring of a robot.
+    """Settings for monitoring a robot.
 
     Attributes:
         dates: date of each file, such as 2026-10-01,2026-11-01. None: from the date column, otherwise from the
@@ -38,7 +38,7 @@ class MonitorSettings:
             "--no-history",
             kind=bool,
             read=not_,
-            help="Do not read or write the history of the model, which stores the sessions of all calls.",
+            help="Do not read or write the model's history, which contains the sessions of all earlier runs.",
         ),
     ] = True
     cameras: CameraFiles | None = None

@@ -159,7 +159,7 @@ def loss_scale(
 
 
 def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
-    """Return whether the loss gives any row the weight 0."""
+    """Return whether any loss gives a row a weight of 0."""
     of_each = zip(sensors, losses, view.contributions, view.scales, strict=True)
     return any(
         bool((loss.weight(part.residual_length / scale, sensor.components) == 0).any())

@@ -173,7 +173,9 @@ class _Reader:
             circular, cut = index == 1, None
             if isinstance(pose, Pose) and (circular or kind[1].upper() == "L"):
                 if timed:
-                    self.scan.leave_unchanged(match.start(), "the move has a time, so it has no waypoints")
+                    self.scan.leave_unchanged(
+                        match.start(), "the move states its duration, so no waypoints are added"
+                    )
                 elif circular and _TURNING.search(self.text):
                     self.scan.leave_unchanged(
                         match.start(),
