@@ -344,12 +344,7 @@ def group_faults(
                 problem = f"{kind} '{name}' is in the frames '{frames[0]}' and '{frames[1]}' instead of one"
                 yield (
                     row,
-                    Fault(
-                        problem,
-                        labels("frame"),
-                        value=frame[row],
-                        remedy="use a different name in each frame",
-                    ),
+                    Fault(problem, labels("frame"), value=frame[row], remedy="rename it in one frame"),
                 )
     for name, rows in _groups(data.text("anchor")).items():
         places = np.where(np.isnan(anchor_place[rows]), np.inf, anchor_place[rows])  # NaN equals NaN
