@@ -27,7 +27,7 @@ def measure(true, count, seed):
 
 model = calibrate(robot, measure(before, 80, 1), CalibrationSettings(folds=0)).model
 renewed = recalibrate(model, measure(after, 10, 2))
-print(renewed.summary.changed)
+print(renewed.summary.change_sentence)
 new = measure(after, 300, 3)
 
 figure = Figure(figsize=(4, 3), layout="constrained")

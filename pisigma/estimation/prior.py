@@ -16,12 +16,12 @@ _RELAXATION = 1.5
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """Independent normal unknowns: precision `base / sizes[group]²`.
+    """Independent normal unknowns: precision `unit_precision / sizes[group]²`.
 
     Attributes:
         unit_precision: 1 / variance at size 1; 0 without a prior.
         group: index in `sizes` of every unknown.
-        sizes: standard deviation of every group at base 1.
+        sizes: standard deviation of the unknowns of every group with `unit_precision` 1.
         class_count: number of leading groups that are classes of geometric parameters. Their sizes, which are factors
             on the stated sizes, remain as estimated by the geometric calibration: over a narrow joint range, low
             harmonics resemble geometry, and if they could replace it, the arm would be wrong beyond this range.
@@ -44,7 +44,9 @@ class GaussianPrior:
     def updated(
         self, squared_unknowns: Float64[Tensor, " groups"], determined_unknowns: Float64[Tensor, " groups"]
     ) -> "GaussianPrior":
-        """Update the sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7): size² = Σ x² base / Σ determined.
+        """Update the sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7): size² = Σ p x² / Σ determined.
+
+        p is `unit_precision`.
 
         The rule approaches its fixed point from one side in ever shorter steps and is therefore over-relaxed.
         """

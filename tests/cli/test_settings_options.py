@@ -152,7 +152,7 @@ def test_no_setting_gets_an_empty_value_by_accident(key):
 def test_shells_complete_keys():
     shell = {
         "_PISIGMA_COMPLETE": "complete_bash",
-        "COMP_WORDS": "pisigma calibrate --set so",
+        "COMP_WORDS": "pisigma calibrate --set socket_d",
         "COMP_CWORD": "3",
     }
     assert CliRunner().invoke(app, [], prog_name="pisigma", env=shell).output.split() == ["socket_distance="]

@@ -16,7 +16,11 @@ from testing.simulated_arm import simulate
 from typer.main import get_command
 
 from pisigma.cli.main import app
-from pisigma.deployment.export.programs.text import metres_and_rotation_vector, millimetres_and_euler, numbers
+from pisigma.deployment.export.programs.text import (
+    format_numbers,
+    metres_and_rotation_vector,
+    millimetres_and_euler,
+)
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
@@ -141,7 +145,9 @@ def text(content: str) -> Maker:
 
 def ur_program(path: Path, small: Path) -> None:
     """Write a URScript program of a UR5."""
-    poses = [numbers(metres_and_rotation_vector(T), 9) for T in _near("ur5", (10, -80, 90, -60, -70, 20), 2)]
+    poses = [
+        format_numbers(metres_and_rotation_vector(T), 9) for T in _near("ur5", (10, -80, 90, -60, -70, 20), 2)
+    ]
     moves = "".join(f"  movel(p[{one}], a=0.5, v=0.1)\n" for one in poses)
     path.write_text(f"def cell():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n{moves}end\n")
 

@@ -12,7 +12,7 @@ from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
 
 _EXPLAINED = 0.999
-"""Probability with which errors that the budget explains pass the test of `contradicted`."""
+"""Probability with which errors that the budget explains pass the test of `is_contradicted`."""
 _MAX_FREEDOM = 1e9
 """Degrees of freedom that are treated as infinite."""
 _NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."

@@ -119,7 +119,7 @@ def test_equal_columns_without_a_prior_are_still_solved() -> None:
     twice = torch.cat([X, 1e-6 * X[:, :1]], 1)
     flat = replace(
         poses().prior,
-        base=torch.zeros(6).double(),
+        unit_precision=torch.zeros(6).double(),
         group=torch.zeros(6, dtype=torch.int64),
         sizes=torch.ones(1).double(),
     )
