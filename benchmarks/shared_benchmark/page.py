@@ -104,4 +104,8 @@ def _accuracy(results: Results, name: str) -> str:
 def _short(statuses: tuple[str, ...]) -> str:
     """Return the first status other than "done" without its details."""
     first = next(status for status in statuses if status != "done")
-    return first.split(":")[0].replace("does not use rows of the kind 'socket'", "no sockets")
+    short = {
+        "does not use rows of the kind 'socket'": "no sockets",
+        "predicts no rotations, to which base and tool could be fitted": "no rotations",
+    }
+    return short.get(first, first.split(":")[0].split(" after ")[0])
