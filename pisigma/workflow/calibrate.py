@@ -284,7 +284,11 @@ def calibrator_of(
     usual = _class_of(settings, robot)
     zeros = max(angle, usual.prior_sizes.joint_offset) if usual is SERVO else angle
     # An error that several distances share is not averaged out by them.
-    shared = math.sqrt(len(distances) / max(len(settings.socket_distances), 1)) or 1.0
+    names = [name for pair in distances for name in pair]
+    shared = max(
+        (len(matching_sockets({pair: one}, names)) for pair, one in settings.socket_distances.items()),
+        default=1,
+    )
     geometric = GeometricCalibrator(
         robot,
         free=settings.free,
@@ -292,7 +296,7 @@ def calibrator_of(
         loss=HampelLoss() if settings.robust else SquaredLoss(),
         robot_class=settings.robot_class,
         socket_distances=dict(distances),
-        socket_sigma=settings.socket_sigma * shared,
+        socket_sigma=settings.socket_sigma * math.sqrt(shared),
     )
     if settings.model != "hybrid":
         return geometric

@@ -109,11 +109,15 @@ def distances(*stated: str) -> dict[tuple[str, str], float]:
     return calibrator_of(settings, pisigma.Robot.load("panda"), matching).socket_distances
 
 
-def test_distances_of_one_plate_share_their_error():
-    settings = CalibrationSettings(socket_distances={("*/0", "*/1"): 0.05}, socket_sigma=1e-4)
+@pytest.mark.parametrize("others", [False, True])
+def test_distances_of_one_plate_share_their_error(others):
+    """Further entries with one distance each do not make the shared error smaller."""
+    plate = {("*/0", "*/1"): 0.05}
+    single = {("left/0", "right/1"): 0.4} if others else {}
+    settings = CalibrationSettings(socket_distances=plate | single, socket_sigma=1e-4)
     matching = matching_sockets(settings.socket_distances, SOCKETS)
     calibrator = calibrator_of(settings, pisigma.Robot.load("panda"), matching).geometric_calibrator
-    assert calibrator.socket_sigma / len(matching) ** 0.5 == pytest.approx(1e-4)
+    assert calibrator.socket_sigma / len(matching_sockets(plate, SOCKETS)) ** 0.5 == pytest.approx(1e-4)
 
 
 def test_known_distances_between_sockets():
