@@ -58,8 +58,7 @@ class CorrectedIK(AbstractInverse):
         from pisigma.model.stated_conditions import condition_warnings
 
         route = NumericIK(model)
-        self.name = model.name
-        self.branches, self.order = route.branches, route.order
+        self.name, self.branches, self.order = model.name, route.branches, route.order
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
@@ -352,9 +351,10 @@ class CorrectedIK(AbstractInverse):
         """Return solutions as tensors, with gradients if required, if the poses are tensors, otherwise as arrays."""
         if poses is None:
             return replace(solution.map(as_array), owner=self)
-        from pisigma.model.inverse.numeric_arm import as_tensors
+        from pisigma.model.inverse.numeric_arm import as_tensor, like_poses
 
-        return as_tensors(solution, poses, self.model if poses.requires_grad else None, self, axes)
+        tensors = replace(solution.map(as_tensor), owner=self)
+        return like_poses(tensors, poses, self.model if poses.requires_grad else None, axes)
 
 
 def load(folder: str | os.PathLike[str]) -> CorrectedIK:

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.model.calibrated_model import CalibratedModel, hybrid_motion
-from pisigma.model.inverse.solution import AbstractInverse, Solution
+from pisigma.model.inverse.solution import Solution
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.jacobian import (
@@ -169,40 +169,35 @@ class NumericArm:
         return limits, ((limits[:, 1] - limits[:, 0]) / 2).clamp(min=1e-9)
 
 
-def as_tensors(
-    solution: Solution,
-    poses: Float[Tensor, "*batch 4 4"],
-    model: CalibratedModel | None,
-    owner: AbstractInverse,
-    axes: TaskAxes,
+def as_tensor(values: Any) -> Tensor:
+    """Return values as a tensor on the CPU."""
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
+
+
+def like_poses(
+    solution: Solution, poses: Float[Tensor, "*batch 4 4"], model: CalibratedModel | None, axes: TaskAxes
 ) -> Solution:
-    """Return solutions as tensors with the dtype and device of the poses, and with gradients with respect to them.
+    """Return solutions with the dtype and device of the poses, and with gradients with respect to them.
 
     Args:
-        solution: float64 arrays or tensors on the CPU; solutions of all branches have one batch axis more than the
-            poses.
+        solution: tensors on the CPU; solutions of all branches have one batch axis more than the poses.
         poses: poses as passed by the caller.
         model: calibrated model; None if no gradients are required.
-        owner: see `Solution`.
         axes: axes of the tool that are constrained.
     """
-    result = solution.map(_tensor)
     if model is not None and torch.is_grad_enabled():
-        every = poses.unsqueeze(-3) if result.status.ndim > poses.ndim - 2 else poses
-        result = with_pose_gradients(model, result, every.expand(*result.status.shape, 4, 4), axes)
+        every = poses.unsqueeze(-3) if solution.status.ndim > poses.ndim - 2 else poses
+        solution = with_pose_gradients(model, solution, every.expand(*solution.status.shape, 4, 4), axes)
     return replace(
-        result,
-        q=result.q.to(poses),
-        q_nominal=result.q_nominal.to(poses),
-        branch=result.branch.to(poses.device),
-        status=result.status.to(poses.device),
-        domain_measure=result.domain_measure.to(poses),
-        owner=owner,
+        solution,
+        q=solution.q.to(poses),
+        q_nominal=solution.q_nominal.to(poses),
+        branch=solution.branch.to(poses.device),
+        status=solution.status.to(poses.device),
+        position_residual=solution.position_residual.to(poses.device),
+        rotation_residual=solution.rotation_residual.to(poses.device),
+        domain_measure=solution.domain_measure.to(poses),
     )
-
-
-def _tensor(values: Any) -> Tensor:
-    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
 
 
 def with_pose_gradients(
@@ -229,15 +224,19 @@ def with_pose_gradients(
         axes: axes of the tool that are constrained.
     """
     T = T.to("cpu", torch.float64)
-    q_nominal = _attached(model.robot, T, axes, result.q_nominal, partial(joint_jacobian, model.robot))
+    motions: dict[str, Motion] = {"q_nominal": partial(joint_jacobian, model.robot)}
     if model.calibrated is not None:
         identified, hybrid = model.identified, model.hybrid
-
-        motion: Motion = (
+        motions["q"] = (
             partial(joint_jacobian, identified) if hybrid is None else partial(hybrid_motion, hybrid)
         )
-        q = _attached(model.robot, T, axes, result.q, motion)
-        return replace(result, q=q, q_nominal=q_nominal)
+    attached = {
+        name: _attached(model.robot, T, axes, getattr(result, name), motion)
+        for name, motion in motions.items()
+    }
+    if model.calibrated is not None:
+        return replace(result, **attached)
+    q_nominal = attached["q_nominal"]
     if model.network is None:
         return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
     known = torch.isfinite(result.q).all(-1, keepdim=True)
