@@ -78,7 +78,7 @@ def _convert(
     read: Path, like: str, nominal: "Robot", out: Path, max_change_mm: float | None, as_json: bool
 ) -> None:
     """Write the robot of a controller's file; `like` names the nominal one."""
-    from pisigma.deployment.export.controllers.reading import MAX_CHANGE, read_controller_file
+    from pisigma.deployment.export.controllers.controller_file import MAX_CHANGE, read_controller_file
     from pisigma.deployment.export.dh_table import dh_yaml
     from pisigma.files.output_file import check_output, write_atomically
 

@@ -230,7 +230,7 @@ def with_pose_gradients(
         motions["q"] = (
             partial(joint_jacobian, identified) if hybrid is None else partial(hybrid_motion, hybrid)
         )
-    attached = {
+    attached: dict[str, Any] = {
         name: _attached(model.robot, T, axes, getattr(result, name), motion)
         for name, motion in motions.items()
     }

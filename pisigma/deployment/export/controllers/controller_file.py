@@ -3,21 +3,37 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.deployment.export.approximation import all_parameter_indices, approximate_model
+from pisigma.deployment.export.approximation import (
+    Departure,
+    all_parameter_indices,
+    approximate_model,
+    departure_from_nominal,
+)
+from pisigma.deployment.export.dh_table import TABLE_SUFFIXES
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import condition_remarks, corrects_joints, frame_remarks
-from pisigma.deployment.export.joint_offsets import departure_sentence
-from pisigma.files.errors import RobotError
+from pisigma.deployment.export.joint_offsets import departure_sentence, read_offsets
+from pisigma.deployment.export.registry import BUILT_IN
+from pisigma.files.errors import Place, RobotError
+from pisigma.files.input_file import read_text
 from pisigma.lifetime.cell.exports import Contents
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
 _CONDITIONS = frozenset(("payload_kg", "temperature_c"))
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+MAX_CHANGE = 5.0
+"""Largest plausible mean distance [mm] between the tools of a calibrated and the nominal robot on the same base; the
+largest in five published calibrations of Universal Robots arms is 4.2 mm."""
+
+_LEVER = 0.1
+"""Distance from the flange [m] of points to which the limit also applies, so that rotations of the flange count."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +120,7 @@ class ControllerFile:
         options: options of `OPTIONS` that the format accepts.
         refuse: function that raises a `PisigmaError` for invalid requests before anything is loaded.
         contains: contents of a file of this format.
+        marker: beginning of a line that other files with these suffixes do not have; empty if there are no others.
     """
 
     name: str
@@ -119,6 +136,7 @@ class ControllerFile:
     options: frozenset[str] = field(default_factory=frozenset)
     refuse: Callable[[ExportRequest], None] = lambda request: None
     contains: Contents = "kinematics"
+    marker: str = ""
 
     def export_format(self) -> ExportFormat:
         """Return the format of `pisigma export`."""
@@ -226,3 +244,84 @@ def check_plain_joints(robot: Robot, kind: str, count: int | None = None) -> Non
             expected="one row per joint",
             remedy="choose --format urdf or dh",
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerReading:
+    """Result of reading a controller's file.
+
+    Attributes:
+        robot: nominal robot with the parameters of the file; its `source` names the file and the frames of its poses.
+        deviation_from_nominal: distance between its tool and that of the nominal robot, in the same frame.
+        frames: frames of the controller relative to frames of the nominal robot; None if they are equal.
+        remarks: sentences on the description of the format, its tests, and the frames of poses.
+    """
+
+    robot: Robot
+    deviation_from_nominal: Departure
+    frames: Frames | None
+    remarks: tuple[str, ...]
+
+
+def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHANGE) -> ControllerReading:
+    """Read a controller's file as a robot.
+
+    Supported files are Universal Robots' calibration.conf, the kinematics YAML of their ROS driver, Staubli's arm.cfx,
+    and tables of joint offsets or counts written by pisigma. Xacro and URDF files need no nominal robot; load them with
+    `Robot.load`.
+
+    Args:
+        path: file to read.
+        nominal: robot of the controller without the file, which provides names and limits, and base and tool if the
+            file has none.
+        max_change: largest accepted mean distance [mm] between the two tools in the same frame, and between points at
+            `_LEVER` from them due to their rotations.
+
+    Raises:
+        RobotError: the file cannot be read, is of another kind, does not match the robot, or changes it by more than
+            `max_change`.
+    """
+    suffix, kinds = path.suffix.lower(), _kinds()
+    suffixes = dict.fromkeys([*(one for kind in kinds for one in kind.suffixes), *TABLE_SUFFIXES])
+    if suffix not in suffixes:
+        raise RobotError(
+            expected=f"a controller's file with the suffix {' or '.join(suffixes)}",
+            value=suffix,
+            at=Place(path),
+        )
+    text = read_text(path, RobotError, "text")
+    suited = (kind for kind in kinds if suffix in kind.suffixes and f"\n{kind.marker}" in f"\n{text}")
+    file = next(suited, None)
+    read = read_offsets if file is None or file.read is None else file.read
+    robot = read(text, str(path), nominal)
+    convention = file.convention(nominal) if file else Convention(nominal)
+    # The base and tool of the file define the frames of its poses and are not treated as changes by the calibration.
+    there = nominal.with_geometry(base=robot.base, tool=robot.tool)
+    change = departure_from_nominal(robot, with_frames(convention.nominal, text) if file else there)
+    if not max(change.mean_mm, _LEVER * change.mean_mrad) <= max_change:
+        raise RobotError(
+            f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / _LEVER:g} mrad "
+            f"on average, got {change.mean_mm:.4g} mm and {change.mean_mrad:.4g} mrad relative to robot "
+            f"'{nominal.name}'",
+            expected=f"a mean change of at most {max_change:g} mm",
+            value=change.mean_mm,
+            at=Place(path),
+            remedy="check that --like is the robot of this file and that its units are radians and metres, or state "
+            "--max-change-mm",
+        )
+    frames = convention.frames
+    source = f"Read from {path.name} with the nominal robot '{nominal.name}'."
+    source = f"{source} {frames.sentence}" if frames else source
+    remarks = (
+        (file.source, *convention.remarks)
+        if file
+        else ("Tables of offsets and counts are a format of pisigma.",)
+    )
+    return ControllerReading(replace(robot, source=source), change, frames, remarks)
+
+
+def _kinds() -> list[ControllerFile]:
+    """Return the registered kinds of manufacturers' files that are read with a nominal robot."""
+    modules = dict.fromkeys(module for module, _ in BUILT_IN.values() if module.startswith(__package__))
+    files = [getattr(import_module(module.partition(":")[0]), "FILE", None) for module in modules]
+    return [file for file in files if file is not None and file.read is not None]

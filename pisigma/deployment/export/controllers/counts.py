@@ -11,10 +11,9 @@ from pisigma.deployment.export.controllers.controller_file import (
     FileContent,
     untested_sentence,
 )
-from pisigma.deployment.export.controllers.reading import read_offsets
 from pisigma.deployment.export.dh_table import csv_table, parameter_columns
 from pisigma.deployment.export.export_format import ExportRequest
-from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between
+from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between, read_offsets
 from pisigma.files.errors import OutputError
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units

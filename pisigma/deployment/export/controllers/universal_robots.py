@@ -1,6 +1,5 @@
 """Universal Robots' `calibration.conf`: differences of calibrated from nominal DH parameters."""
 
-import math
 import re
 
 import numpy as np
@@ -17,48 +16,18 @@ from pisigma.deployment.export.controllers.ur_models import (
     check_robot,
     controller_geometry,
     convention,
+    without_beta,
 )
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
-from pisigma.robot.chains import robot_of_origins, with_one_row_per_joint
+from pisigma.robot.chains import with_one_row_per_joint
 from pisigma.robot.description import Robot
-from pisigma.robot.urdf_frames import Frame
 
 KEYS = {"delta_theta": 0, "delta_a": 2, "delta_d": 1, "delta_alpha": 3}
 """Column of `DH_COLUMNS` for every key of the file; radians and metres."""
 
-_TILTED = 1e-6
-"""Sine of the angle between two axes below which they are treated as parallel; otherwise their common normal could be
-1,000 km away, and rounding of such large numbers would move the tool."""
-
 _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
-
-
-def without_beta(origins: list[Frame], robot: Robot) -> Robot:
-    """Convert a robot to the manufacturer's rows, in which beta is 0 and the last row has neither a nor alpha.
-
-    Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of this row and of
-    the next are large and nearly cancel, as in the manufacturer's files. Of the two directions of a normal, the one
-    that changes theta by less than 90 deg is used.
-
-    Args:
-        origins: frames of the joints, see `ControllerGeometry.origins`.
-        robot: nominal robot with the base and tool that belong to these frames.
-    """
-    plain = robot_of_origins(robot, origins, np.eye(4), _TILTED)
-    dh = plain.dh.copy()
-    dh[:, 4] = 0.0  # axes that are parallel up to `_TILTED`
-    turned = 0.0
-    for joint, (row, theta) in enumerate(zip(dh, robot.dh[:, 0].tolist(), strict=True), 1):
-        row[0] = theta + math.remainder(row[0] + turned - theta, 2 * math.pi)
-        turned = 0.0
-        if abs(row[0] - theta) > math.pi / 2 and joint < len(dh):
-            # RotZ(t + pi) Trans(-a, 0, d) RotX(-alpha) = RotZ(t) Trans(a, 0, d) RotX(alpha) RotZ(pi)
-            turned = math.pi
-            row[0] -= math.copysign(turned, row[0] - theta)
-            row[2:4] *= -1
-    return plain.with_geometry(dh=dh)
 
 
 def write_calibration(content: FileContent) -> str:

@@ -1,5 +1,6 @@
 """DH parameters of Universal Robots, and their frames relative to the frames of a robot description."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float64
 from pisigma.deployment.export.approximation import ApproximationProblem, solve_approximation
 from pisigma.deployment.export.controllers.controller_file import Convention, Frames, check_plain_joints
 from pisigma.files.errors import RobotError
-from pisigma.robot.chains import joint_origins
+from pisigma.robot.chains import joint_origins, robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, translation, xyzrpy_of
@@ -40,6 +41,9 @@ _NEAR_ANGLE, _NEAR_LENGTH = np.deg2rad(0.5), 0.01
 """Distances of a calibrated robot's frames from right angles [rad] and from the origin [m] up to which the frames are
 rounded to these."""
 _POSES = 200
+_TILTED = 1e-6
+"""Sine of the angle between two axes below which they are treated as parallel; otherwise their common normal could be
+1,000 km away, and rounding of such large numbers would move the tool."""
 
 
 _DRIVER = "github.com/UniversalRobots/Universal_Robots_ROS_Driver"
@@ -168,6 +172,32 @@ def controller_geometry(described_robot: Robot) -> ControllerGeometry:
         remedy="for another arm of Universal Robots, give a robot file with the maker's DH parameters (theta 0, a "
         "negative, alpha 90, 0, 0, 90, -90, 0 deg)",
     )
+
+
+def without_beta(origins: list[Frame], robot: Robot) -> Robot:
+    """Convert a robot to the manufacturer's rows, in which beta is 0 and the last row has neither a nor alpha.
+
+    Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of this row and of
+    the next are large and nearly cancel, as in the manufacturer's files. Of the two directions of a normal, the one
+    that changes theta by less than 90 deg is used.
+
+    Args:
+        origins: frames of the joints, see `ControllerGeometry.origins`.
+        robot: nominal robot with the base and tool that belong to these frames.
+    """
+    plain = robot_of_origins(robot, origins, np.eye(4), _TILTED)
+    dh = plain.dh.copy()
+    dh[:, 4] = 0.0  # axes that are parallel up to `_TILTED`
+    turned = 0.0
+    for joint, (row, theta) in enumerate(zip(dh, robot.dh[:, 0].tolist(), strict=True), 1):
+        row[0] = theta + math.remainder(row[0] + turned - theta, 2 * math.pi)
+        turned = 0.0
+        if abs(row[0] - theta) > math.pi / 2 and joint < len(dh):
+            # RotZ(t + pi) Trans(-a, 0, d) RotX(-alpha) = RotZ(t) Trans(a, 0, d) RotX(alpha) RotZ(pi)
+            turned = math.pi
+            row[0] -= math.copysign(turned, row[0] - theta)
+            row[2:4] *= -1
+    return plain.with_geometry(dh=dh)
 
 
 def convention(described_robot: Robot) -> Convention:

@@ -10,12 +10,12 @@ from pisigma.deployment.export.controllers.controller_file import (
     untested_sentence,
     with_frames,
 )
-from pisigma.deployment.export.controllers.universal_robots import without_beta
 from pisigma.deployment.export.controllers.ur_models import (
     JOINTS,
     check_robot,
     controller_geometry,
     convention,
+    without_beta,
 )
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import RobotError
@@ -167,5 +167,6 @@ FILE = ControllerFile(
     check=check_robot,
     convention=convention,
     contains="description",
+    marker="kinematics:",
 )
 FORMAT = FILE.export_format()

@@ -12,9 +12,12 @@ from testing.models import joints_around
 from testing.refusals import refused
 
 from pisigma.deployment.export.controllers import counts, staubli, universal_robots, ur_ros
-from pisigma.deployment.export.controllers.controller_file import FileContent, untested_sentence
-from pisigma.deployment.export.controllers.reading import read_controller_file
-from pisigma.deployment.export.controllers.ur_models import controller_geometry
+from pisigma.deployment.export.controllers.controller_file import (
+    FileContent,
+    read_controller_file,
+    untested_sentence,
+)
+from pisigma.deployment.export.controllers.ur_models import controller_geometry, without_beta
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_model
 from pisigma.files.errors import OutputError, RobotError
@@ -112,7 +115,7 @@ def test_a_published_calibration_is_read():
     q = torch.from_numpy(np.random.default_rng(0).uniform(-3, 3, (100, 6)))
     off = (forward_kinematics(robot, q) - forward_kinematics(nominal, q))[:, :3, 3].norm(dim=-1)
     assert 1e-3 < float(off.max()) < 0.02
-    again = universal_robots.without_beta(*controller_geometry(nominal).origins(robot))
+    again = without_beta(*controller_geometry(nominal).origins(robot))
     assert far_apart(again, robot) < 1e-9
     assert np.abs(again.dh[1:4, 1]).max() > 400
 

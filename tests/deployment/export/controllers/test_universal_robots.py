@@ -21,8 +21,7 @@ from testing.published_arms import (
 from testing.refusals import refused
 
 from pisigma.deployment.export.controllers import universal_robots, ur_ros
-from pisigma.deployment.export.controllers.controller_file import FileContent
-from pisigma.deployment.export.controllers.reading import read_controller_file
+from pisigma.deployment.export.controllers.controller_file import FileContent, read_controller_file
 from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_model
