@@ -21,6 +21,12 @@ def binomial_interval(errors: RowErrors, share: float) -> tuple[float, float]:
     return float(low) / count, float(high) / count
 
 
+def agrees(errors: RowErrors, share: float) -> bool:
+    """Return whether a coverage differs from a nominal share by no more than fits of one kind differ (99 %, t test)."""
+    limit = scipy.stats.t.ppf((1 + SCATTER) / 2, len(np.unique(errors.fold)) - 1)
+    return bool(abs(errors.coverage(share) - share) <= limit * errors.coverage_error(share))
+
+
 def covered(results: Results, method: str) -> dict[tuple[str, str], RowErrors]:
     """Return the errors of a method by series and split, where it predicts deviations."""
     found = {(name, split): results.errors.get((name, split, method)) for name, split in results.pairs}
@@ -58,9 +64,12 @@ def pooled_table(results: Results) -> str:
             for one in inside:
                 low, high = binomial_interval(one, SHARE)
                 within += low <= one.coverage(SHARE) <= high
+            of_fits = sum(agrees(one, SHARE) for one in inside)
             cells = [f"{_pooled(ones):.1%}" if ones else "" for ones in (inside, outside)]
-            rows.append([f"`{method}`", cells[0], f"{within} of {len(inside)}", cells[1]])
-    head = ["method", "95 % intervals, inside", "splits within binomial scatter", "outside"]
+            counts = [f"{count} of {len(inside)}" for count in (within, of_fits)]
+            rows.append([f"`{method}`", cells[0], *counts, cells[1]])
+    head = ["method", "95 % intervals, inside", "splits within binomial scatter"]
+    head += ["splits within the scatter between fits", "outside"]
     return table(head, rows)
 
 

@@ -24,6 +24,7 @@ class RowErrors:
     Attributes:
         row: row numbers in the file of the held-out rows, from 0.
         group: number of the configuration or placement of every row; rows of a group are resampled together.
+        fold: number of the fit that predicted every row.
         error: measured minus predicted position (rows, 3) [mm]; for a socket, its position according to the other rows
             minus that according to this row.
         sigma: predicted standard deviation of the error (rows, 3) [mm]; NaN where no value was predicted.
@@ -32,6 +33,7 @@ class RowErrors:
 
     row: Array
     group: Array
+    fold: Array
     error: Array
     sigma: Array
     angle: Array
@@ -43,8 +45,19 @@ class RowErrors:
 
     def coverage(self, share: float) -> float:
         """Return the actual share of coordinates within the predicted interval of a nominal share."""
-        inside = np.abs(self.error) <= normal_quantile(share) * self.sigma
-        return float(inside.mean()) if np.isfinite(self.sigma).all() else float("nan")
+        return float(self._inside(share).mean()) if np.isfinite(self.sigma).all() else float("nan")
+
+    def coverage_error(self, share: float) -> float:
+        """Return the standard error of the coverage from its scatter between fits; NaN for a single fit.
+
+        All rows that one fit predicts share the errors of its parameters, so they are not independent.
+        """
+        fits = np.unique(self.fold)
+        ones = [self._inside(share)[self.fold == fit].mean() for fit in fits]
+        return float(np.std(ones, ddof=1) / np.sqrt(len(fits))) if len(fits) > 1 else float("nan")
+
+    def _inside(self, share: float) -> Array:
+        return np.abs(self.error) <= normal_quantile(share) * self.sigma
 
 
 def normal_quantile(share: float) -> float:
@@ -76,7 +89,9 @@ def row_errors(series: Series, prediction: Prediction, rows: Rows, numbers: Arra
         skew = between - between.transpose(0, 2, 1)
         sine = np.sqrt((skew**2).sum((1, 2)) / 8)
         angle = np.rad2deg(np.arctan2(sine, (np.trace(between, axis1=1, axis2=2) - 1) / 2))
-    return RowErrors(numbers, groups_of(series)[numbers], error * 1e3, sigma * 1e3, angle)
+    return RowErrors(
+        numbers, groups_of(series)[numbers], np.zeros_like(numbers), error * 1e3, sigma * 1e3, angle
+    )
 
 
 def groups_of(series: Series) -> Array:

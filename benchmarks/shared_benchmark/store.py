@@ -104,4 +104,5 @@ def errors_of(rows: pa.Table, series: str, split: str, method: str) -> RowErrors
         np.stack([columns[f"{what}_{axis}_mm"] for axis in "xyz"], 1).astype(float)
         for what in ("error", "sigma")
     )
-    return RowErrors(columns["row"], columns["group"], error, sigma, columns["angle_deg"].astype(float))
+    row, group, fold, angle = (columns[name] for name in ("row", "group", "fold", "angle_deg"))
+    return RowErrors(row, group, fold, error, sigma, angle.astype(float))

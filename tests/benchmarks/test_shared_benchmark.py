@@ -129,7 +129,12 @@ def test_positions_alone_are_not_compared_with_another_session(module, shared_da
 def make_errors(scores: ModuleType, scale: float) -> object:
     error = scale * np.random.default_rng(1).standard_normal((400, 3))
     return scores.RowErrors(
-        np.arange(400), np.arange(400) // 2, error, np.full((400, 3), scale), np.zeros(400)
+        np.arange(400),
+        np.arange(400) // 2,
+        np.arange(400) // 80,
+        error,
+        np.full((400, 3), scale),
+        np.zeros(400),
     )
 
 
@@ -217,6 +222,12 @@ def test_intervals_of_an_error_and_of_a_coverage(module):
     assert_close(scores.rms_interval(two), [2 * low, 2 * high], rtol=1e-12)
     low, high = coverage.binomial_interval(one, 0.95)
     assert low < one.coverage(0.95) < high
+    assert coverage.agrees(one, 0.95)
+    assert not coverage.agrees(dataclasses.replace(one, sigma=1.3 * one.sigma), 0.95)
+    shared = 1.2 * np.array([1.0, 0.6, 1.5, 0.8, 1.2])[one.fold, None]  # as of fits with unequal errors
+    unequal = dataclasses.replace(one, error=shared * one.error)
+    assert unequal.coverage(0.95) < low
+    assert coverage.agrees(unequal, 0.95)
 
 
 def test_the_page_is_made_from_the_stored_results_and_explains_every_loss(module):
