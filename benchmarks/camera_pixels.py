@@ -4,8 +4,8 @@
 
 Arms, camera, board and repeatability are those of `camera.py`. Every image is rendered pixel by pixel (with lens
 distortion, blur, defocus, uneven light and noise), its corners are detected, and the arm is calibrated with them.
-For comparison the arm is calibrated with the ideal corners of the same images: with normal noise of the size of
-the detection errors, with the noise of `camera.py`, and without noise. Intrinsics are fixed.
+For comparison the arm is calibrated with the ideal corners of the same images: with normally distributed noise of the
+size of the detection errors, with the noise of `camera.py`, and without noise. Intrinsics are fixed.
 Errors are those of the camera's position over 400 postures of the whole joint space after the best rigid alignment,
 pooled over draws.
 """

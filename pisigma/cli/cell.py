@@ -144,7 +144,9 @@ def output_in_cell(cell: "Cell | None", subfolder: str, suffix: str) -> Path:
     from pisigma.workflow.cell.new_files import output_path
 
     if cell is None:
-        raise typer.BadParameter("expected a path", param_hint="'--out'")
+        raise typer.BadParameter(
+            "expected the path of the output, because no cell is given", param_hint="'--out'"
+        )
     return output_path(cell.folder, subfolder, suffix)
 
 

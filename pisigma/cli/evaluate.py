@@ -44,7 +44,7 @@ def evaluate(
     """Compare models on measurements, with confidence intervals, and check them against acceptance limits.
 
     Compares a single model with the nominal robot. Excludes rows of the set "train". Exits with status 3 if a
-    model misses a limit, the base or the tool has moved, or the errors are too large for a calibrated robot.
+    model misses a limit, if the base or the tool has moved, or if the errors are too large for a calibrated robot.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import evaluate as workflow

@@ -37,7 +37,7 @@ from pisigma.cli.verify import verify
 
 app = typer.Typer(
     name="pisigma",
-    help="Calibrate robots from measurements and compute joint values that reach the pose.",
+    help="Calibrate robots from measurements and compute joint values that reach the requested pose.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

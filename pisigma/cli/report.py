@@ -48,8 +48,8 @@ def report(
     """Write a report as one HTML page: accuracy, where it is worst, what limits it, what to measure next.
 
     The report of a cell also contains what its acceptance needs: instrument, uncertainty budget, measured errors, and
-    who accepted the model. Exits with status 3 if the rows must not be trusted, or the measured errors are larger than
-    the budget explains; the page says why.
+    who accepted the model. Exits with status 3 if the rows must not be trusted, or if the measured errors are larger
+    than the budget explains; the page says why.
     """
     from pisigma.lifetime.cell.layout import REPORTS, model_folder
     from pisigma.workflow import report as workflow

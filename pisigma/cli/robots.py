@@ -18,7 +18,7 @@ Read = Annotated[
     Path | None,
     typer.Option(
         help="Read a controller's calibration: calibration.conf or kinematics YAML of Universal Robots, Staubli "
-        "arm.cfx, or a table of joint offsets or counts."
+        "arm.cfx, or a table of joint offsets or encoder counts."
     ),
 ]
 Like = Annotated[

@@ -94,7 +94,7 @@ def _assignments(known: Mapping[str, Setting]) -> inspect.Parameter:
     option = typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Set a setting by its key, as in cell.yaml; --help-all lists the keys. May be repeated.",
+        help="State a setting by its key, as in cell.yaml; --help-all lists the keys. May be repeated.",
         autocompletion=lambda incomplete: [f"{key}=" for key in known if key.startswith(incomplete)],
     )
     kind = Annotated[list[str] | None, option]

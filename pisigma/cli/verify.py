@@ -54,7 +54,7 @@ def verify(
     Compares the corrected model with the nominal robot. Also reports what has moved since the model was made and how to
     recalibrate, and names setup faults (units, order, signs or zeros of joints, a correction applied twice or not at
     all) that explain large errors. Excludes rows of the set "train". Exits with status 3 if the corrected model does
-    not explain the measurements better, or a part of the arm, its base or its tool has moved.
+    not explain the measurements better than the nominal robot, or if a part of the arm, its base or its tool has moved.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow

@@ -222,7 +222,7 @@ class IdentificationError(PisigmaError, ValueError):
 
 
 class ImplausibleError(IdentificationError):
-    """No calibration error explains the measurements: they belong to another robot or are in other units."""
+    """No geometric errors of the robot explain the measurements: they belong to another robot or are in other units."""
 
 
 class PlanningError(PisigmaError, ValueError):

@@ -66,7 +66,7 @@ def _check_content(
         return
     if not is_model(target):
         raise OutputError(
-            "the output exists and is not a model folder",
+            "the output already exists and is not a model folder",
             expected="a model folder",
             at=Place(folder),
             remedy="choose another --out or remove it",

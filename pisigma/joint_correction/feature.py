@@ -61,8 +61,8 @@ class AbstractFeature(ABC):
         used: `(dof, m)`: mask of the columns that a joint uses; weights of other columns must be 0.
         group: `(dof, m)`: index of the prior scale of a column's weight, from 0.
         group_names: names of the groups of weights that have a common prior scale.
-        size: size among features of the same name that are tried in sequence, such as the number of harmonics; 0 if
-            there is only one.
+        size: size among features of the same name that are tried one after another, such as the number of harmonics; 0
+            if there is only one.
         highest_harmonic: highest harmonic of a joint value in the columns.
     """
 

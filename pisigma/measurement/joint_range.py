@@ -96,7 +96,7 @@ def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
     joint = int(turning[largest.argmax()])
     return (
         f"Column tau_{joint + 1} contains {largest.max():.3g} Nm, but robots of this reach have less "
-        f"than {limit:.2g} Nm: expected Nm, got probably mNm or Nmm; convert the columns tau_1, tau_2, ...",
+        f"than {limit:.2g} Nm; the values are probably in mNm or Nmm: convert the columns tau_1, tau_2, ... to Nm",
     )
 
 

@@ -141,7 +141,9 @@ def _check_rotations(data: MeasuredFields) -> None:
     deviation = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
     left_handed = (torch.linalg.cross(R[..., 0], R[..., 1]) * R[..., 2]).sum(-1) < 0
     _refuse(data, deviation > _ROTATION_TOLERANCE, "rotation", "an orthonormal matrix", "normalise it")
-    _refuse(data, left_handed, "rotation", "a right-handed matrix", "check its axes, this is a reflection")
+    _refuse(
+        data, left_handed, "rotation", "a right-handed matrix", "check its axes, because this is a reflection"
+    )
 
 
 def _refuse(data: MeasuredFields, bad: Bool[Tensor, " rows"], name: str, expected: str, remedy: str) -> None:

@@ -287,7 +287,7 @@ def known_names(
             crossed = (measurements.target if name_kind == "frame" else measurements.frame)[
                 row
             ] in frames_of_model
-            hint = "check --fixed-camera if it is a camera; " if name and crossed else ""
+            hint = f"check --fixed-camera if '{name}' is a camera; " if name and crossed else ""
             raise MeasurementError(
                 f"the model was not calibrated for {name_kind} '{name}'",
                 value=name,

@@ -109,12 +109,12 @@ class ModelPosterior:
         """
         crossed = {*rows.frame} & {*self.geometry.tools} - {"", *self.geometry.bases}
         if crossed:
+            name = crossed.pop()
             raise MeasurementError(
-                f"'{(name := crossed.pop())}' is a measuring frame of the rows, but in the model it is mounted on "
-                "the flange",
+                f"'{name}' is a measuring frame of the rows, but in the model it is mounted on the flange",
                 value=name,
                 at=Place(rows.source, column="frame"),
-                remedy="check --fixed-camera if it is a camera",
+                remedy=f"check --fixed-camera if '{name}' is a camera",
             )
         for field, stated, known in (
             ("frame", rows.frame, tuple(self.geometry.bases)),

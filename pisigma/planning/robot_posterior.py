@@ -143,7 +143,7 @@ class RobotPosterior:
 
         Raises:
             PoseError: the joint values do not fit the robot.
-            ImplausibleError: no calibration error explains the rows.
+            ImplausibleError: no geometric errors of the robot explain the rows.
         """
         try:
             return RobotPosterior.from_result(

@@ -26,7 +26,7 @@ _REDUNDANT = 1 - 1e-6
 _LETTER = 0.07
 """Width of a character of the names along tables [inch]."""
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
-"""Line and marker of every model, so that they differ without colour."""
+"""Line and marker of every model, so that models can be distinguished without colour."""
 _POINTS = 1_000
 """Points of a curve: 9 per period of the 110th harmonic, 2 per pixel."""
 _MAX_DOTS = 2_000

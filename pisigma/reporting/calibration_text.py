@@ -139,9 +139,9 @@ def scale_text(scale: ScaleFigures) -> str:
     """Return a sentence on the odds of a wrong scale of the sensor, and the error that it would cause."""
     digits = 1 - math.floor(math.log10(scale.sigma)) if scale.sigma > 0 else 5
     return (
-        f"scale of the sensor: lengths of the arm come out {scale.factor:.{digits}f} +- {scale.sigma:.{digits}f} "
-        f"times nominal, with odds of {scale.odds:.2g} to 1 for one common factor, such as a wrong scale of the "
-        f"sensor, against an error of each link. {scale_error_text(scale)}"
+        f"scale of the sensor: the estimated lengths of the arm are {scale.factor:.{digits}f} +- "
+        f"{scale.sigma:.{digits}f} times the nominal ones; the odds of one common factor, such as a wrong scale of the "
+        f"sensor, against an error of each link are {scale.odds:.2g} to 1. {scale_error_text(scale)}"
     )
 
 

@@ -133,7 +133,7 @@ def _range_table(summary: DistillationSummary) -> Table:
 UNDETERMINED = (
     "A parameter that the rows do not determine, such as the position of the first axis in the base, has mean 0 and "
     "the usual standard deviation of the robot's class. Parameters in a sum, such as d_2 and d_3 of parallel axes, "
-    "move the tool in the same way as each other, base or tool, so only their sum is that of the robots."
+    "move the tool in the same way as one another, or as base or tool, so only their sum is determined."
 )
 
 

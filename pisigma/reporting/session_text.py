@@ -25,9 +25,7 @@ def session_text(state: SessionState, closing_sentences: Sequence[str] = ()) -> 
     reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
     alarmed = len(state.rows.line) - counting
     trust = (
-        f"{count_text(counting, 'row')} counted, {alarmed} left out"
-        if alarmed
-        else f"all {counting} rows count"
+        f"{count_text(counting, 'row')} used, {alarmed} left out" if alarmed else f"all {counting} rows count"
     )
     if state.advice.action == "correct":
         trust = "no: all rows have the same fault"

@@ -23,7 +23,7 @@ class ParameterSection(Section):
     """Section of a robot file with the DH and Hayati parameters of a row.
 
     Attributes:
-        theta_deg: rotation about the joint axis z, before the joint value [deg].
+        theta_deg: rotation about the joint axis z at joint value 0 [deg].
         d_mm: translation along z [mm].
         a_mm: translation along x [mm].
         alpha_deg: rotation about x [deg].

@@ -12,7 +12,7 @@ from pisigma.robot.se3 import rotation_from_vector, transform
 
 
 class MeasurementNoise(Section):
-    """Normal noise of every measured coordinate and about every axis.
+    """Normally distributed noise of every measured coordinate and about every axis.
 
     `p_measured = p + s_p · n_p` and `R_measured = Exp(s_r · n_r) · R` where n_p and n_r are three standard normal
     numbers each and Exp is the rotation of a rotation vector, in the frame of measurement. From one generator with

@@ -193,7 +193,7 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
     try:
         found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
         return tuple(one for one in found if not _is_unmodelled(one))
-    except IdentificationError as refusal:  # no calibration error explains the rows
+    except IdentificationError as refusal:  # no geometric errors explain the rows
         sentence = str(refusal).removeprefix(f"{rows.source}: ")
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
 

@@ -148,7 +148,7 @@ class CellScene:
         return self._predicted
 
     def dragged_values(self) -> dict[str, Any]:
-        """Return the keys of `cell.yaml` that were changed by dragging, and since which call of `show_cell`.
+        """Return the values of `cell.yaml` that were changed by dragging, and the number of calls of `show_cell`.
 
         A value that was dragged back is included, because the page has shown it in between.
         """

@@ -248,8 +248,8 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
             "The remaining differences are significant: the joint corrections or several parameters differ."
         )
     pairs = zip(differences.frames[::2], differences.frames[1::2], strict=True)
-    clauses = [f"the {length.what} {length.size} and {angle.size} away" for length, angle in pairs]
-    return (*lines, *((f"{second} has {' and '.join(clauses)} from {first}'s.",) if clauses else ()))
+    clauses = [f"in the {length.what} by {length.size} and {angle.size}" for length, angle in pairs]
+    return (*lines, *((f"{second} differs from {first} {' and '.join(clauses)}.",) if clauses else ()))
 
 
 def _parameter_json(one: ParameterDifference) -> dict[str, Any]:

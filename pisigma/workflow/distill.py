@@ -269,7 +269,7 @@ def _limitations(
         )
     if parent.hybrid is not None and learned_torques(parent.hybrid.correction) is not None:
         sentences.append(
-            "Torques: gravity torques modelled from the joint values are assumed, not measured ones."
+            "Torques: the network assumes gravity torques computed from the joint values, not measured torques."
         )
     return (
         *sentences,

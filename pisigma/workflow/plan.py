@@ -183,7 +183,7 @@ def plan(
         ModelError: the model is unknown.
         MeasurementError: a file of joint values or of measurements cannot be used, or a fault of the setup explains
             the measurements.
-        IdentificationError: no calibration error explains the measurements.
+        IdentificationError: no geometric errors of the robot explain the measurements.
         PlanningError: the surroundings cannot be used, or too few poses are possible in them.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()

@@ -223,7 +223,7 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
         if folder is not None
         else "run it with --out DIR instead of --dry-run to write this model."
         if recalibration.trusted
-        else "correct the problem named above and recalibrate again; no model was written.",
+        else "correct the problem named above and run the recalibration again; no model was written.",
     )
 
 

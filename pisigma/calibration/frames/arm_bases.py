@@ -134,8 +134,8 @@ class ArmBases:
         joint 1.
 
         Args:
-            first: number of an arm.
-            second: number of the other arm.
+            first: index of an arm.
+            second: index of the other arm.
             postures: postures of every arm; the n-th postures of both arms form a pair, in which the shared joints of
                 a torso have the values of the first arm.
         """

@@ -155,7 +155,7 @@ def size_text(cause: Cause) -> str:
     """Describe the size of a cause."""
     error = cause.size * _UNIT
     if cause.name == "camera":
-        return f"{cause.size * _CAMERA_UNIT:.2g} times a typical calibration error"
+        return f"{cause.size * _CAMERA_UNIT:.2g} times the error of a typical calibration"
     if cause.name == "board":
         return f"{error * 100:.2g} %"
     angle = f"{math.degrees(error):.2g} deg"

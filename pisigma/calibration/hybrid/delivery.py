@@ -261,7 +261,7 @@ def _compared(errors: Errors, before: Errors) -> list[Comparison]:
 
 
 def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Posterior:
-    """Return the posterior of the geometric calibration for the rows of the search."""
+    """Return the posterior of the geometric calibration given the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.nominal)[problem.active]

@@ -127,7 +127,7 @@ class FeatureChoice:
 
 
 class FeatureSearch:
-    """Search that tries features in sequence on the same rows."""
+    """Search for features of a joint correction, which tries one after another on the same rows."""
 
     def __init__(
         self,

@@ -29,8 +29,8 @@ def find_spectral_lines(
     The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of the joint
     motions that would cancel the residuals gives the increase of the log likelihood by sine and cosine of each order.
     For pure noise, this gain has an exponential distribution with mean 1. The mean is estimated from the median,
-    because joints cause noise in addition to that of the sensors. Orders whose gain exceeds the prior odds against them
-    are lines with a probability above 1/2, and such lines predict best (median probability model: Barbieri and
+    because joints cause noise in addition to that of the sensors. Orders whose gain exceeds the prior log odds against
+    them are lines with a probability above 1/2, and such lines predict best (median probability model: Barbieri and
     Berger 2004, The Annals of Statistics 32(3), 870-897). The evidence for all lines together decides whether there
     are lines.
 

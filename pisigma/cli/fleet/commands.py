@@ -85,7 +85,7 @@ def estimate_prior(
 def status(folder: Folder, page: Page = None, verbose: Verbose = False, as_json: AsJson = False) -> None:
     """Summarise all cells in a folder: their states, the largest errors, and what to do.
 
-    Exits with status 3 if a cell needs attention, or `pisigma fleet run` has steps to carry out.
+    Exits with status 3 if a cell needs attention, or if `pisigma fleet run` has steps to carry out.
     """
     if show_fleet(folder, page, verbose, as_json).needs_action:
         raise typer.Exit(NOT_ACCEPTED)

@@ -55,7 +55,7 @@ def new(
     """Create a cell: the folder of one robot on its mount, with its settings, sessions, models and history.
 
     With --from MODEL_FOLDER, create a cell that uses this model; with --from MANIFEST, create a cell for every robot,
-    or add the new rows if the cell exists. Exits with status 3 if a robot of the manifest cannot be used.
+    or add the new rows if the cell already exists. Exits with status 3 if a robot of the manifest cannot be used.
     """
     from pisigma.files.model_files import is_model
     from pisigma.measurement.camera.camera_files import CameraFiles

@@ -76,8 +76,8 @@ def ik(
 ) -> None:
     """Compute the corrected joint values that reach a pose, or every pose of a file.
 
-    Exits with status 2 if a pose is unreachable, singular or outside the joint limits, or a row of the file is not a
-    pose; the other solutions are still printed or written.
+    Exits with status 2 if a pose is unreachable, singular or outside the joint limits, or if a row of the file is not
+    a pose; the other solutions are still printed or written.
     """
     _check_options(pose, poses, out, branch, all_branches)
     for name, given in (("--accuracy", accuracy), ("--path", path)):

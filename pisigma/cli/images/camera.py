@@ -31,7 +31,7 @@ def camera(
 ) -> None:
     """Calibrate the intrinsics of a camera from images of a board, with standard deviations.
 
-    Take 20 images or more that fill the whole frame, most of them tilted by 20 to 40 deg.
+    Take 20 images or more in which the board covers all parts of the frame, most of them tilted by 20 to 40 deg.
     """
     check_outputs(out, (".yaml", ".yml"), "a camera", page, [*images, board])
     from pisigma.workflow.images import calibrate_camera as workflow

@@ -31,7 +31,7 @@ Second = Annotated[
     str | None,
     typer.Argument(
         metavar="B",
-        help="Second model, B. [default: for a cell, the model in use, with the preceding model as A]",
+        help="Second model, B. [default: for a cell, the model in use, compared with the previous model]",
         autocompletion=complete_model,
     ),
 ]
@@ -61,7 +61,8 @@ def compare(
 ) -> None:
     """Compare two models of one robot: parameters, positions of the tool, rows and programs.
 
-    Tests differences with the posteriors of both models. Exits with status 3 if the rows must not be trusted.
+    Tests whether differences are significant, with the posteriors of both models. Exits with status 3 if the rows must
+    not be trusted.
     """
     from pisigma.files.output_file import check_page
     from pisigma.lifetime.cell.layout import is_cell, previous_and_current_model

@@ -42,7 +42,7 @@ class LeRobotCorrection:
         scale: rotation [rad] per unit of the value, for every joint.
         offset: offset of every value of a frame [in its unit], 0 for values that are not joints.
         offsets: the joint offsets, with the deviation that they leave.
-        prefix: start of the names of this arm, such as "left_".
+        prefix: prefix of the motor names of this arm, such as "left_".
         motors: motors in the arm's calibration file, by name; None if it is not known.
         version: name, SHA-256 and offsets of the model, as written to the metadata of data sets.
     """
@@ -74,7 +74,7 @@ class LeRobotCorrection:
             units: "degrees" (LeRobot's `use_degrees=true`) or "normalized" (-100 to 100); the values do not show which
                 applies.
             calibration: LeRobot's calibration file of this arm, needed for normalized values.
-            prefix: start of the names of this arm, such as "left_" for one arm of a pair.
+            prefix: prefix of the motor names of this arm, such as "left_" for one arm of a pair.
 
         Raises:
             ModelError: the folder is not a model.

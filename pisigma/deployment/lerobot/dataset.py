@@ -63,20 +63,22 @@ def correct_lerobot_dataset(
         out: folder to write; it must not exist.
         units: units of the joint values.
         calibration: LeRobot's calibration file, needed for normalized values.
-        prefix: start of the names of this arm.
+        prefix: prefix of the motor names of this arm.
 
     Raises:
         MeasurementError: the data set cannot be read, this arm has already been corrected, its values are not those of
             the robot, or they are impossible in these units.
         ModelError: the folder is not a model.
-        OutputError: the new folder exists or cannot be written.
+        OutputError: the new folder already exists or cannot be written.
         ImportError: pyarrow is not installed.
     """
     source, target = LeRobotDataset.open(dataset), Path(os.path.realpath(out))
     record = _record(source, prefix)
     check_conflicts(out, (source.folder, Path(model)))
     if target.exists():
-        raise OutputError("the output exists", at=Place(out), option="out", remedy="choose another folder")
+        raise OutputError(
+            "the output already exists", at=Place(out), option="out", remedy="choose another folder"
+        )
     corrections = {
         key: LeRobotCorrection.load(model, names, units, calibration, prefix)
         for key, names in source.feature_names.items()

@@ -306,7 +306,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
 
 
 def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:
-    """Compute the months since the first session."""
+    """Compute the time of every session since the first one [months]."""
     days = [datetime.date.fromisoformat(one.date).toordinal() for one in records]
     return (torch.tensor(days, dtype=torch.float64) - days[0]) / _DAYS_PER_MONTH
 

@@ -37,7 +37,7 @@ class Repeatability:
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """Cameras and boards of files of detected corners (columns image, corner, u_px, v_px and joint values).
+    """Cameras and boards for files of detected corners (columns image, corner, u_px, v_px and joint values).
 
     Attributes:
         cameras: camera file (YAML of pisigma, ROS or OpenCV) for rows that are corners of boards in images. Requires a
@@ -48,7 +48,7 @@ class CameraFiles:
             are fixed, state is_fixed in their files instead.
         repeatability: repeatability of the robot.
         intrinsics: treatment of the cameras' intrinsics: fixed (as in the camera files), prior (within the stated
-            standard deviations) or free. If none are stated, those of a typical calibration are used.
+            standard deviations, or those of a typical calibration if none are stated) or free.
 
     Raises:
         MeasurementError: no camera or no board is given.

@@ -34,8 +34,8 @@ class JoinedRows:
     Attributes:
         rows: the measurements in the order of the list, with joint values.
         joined_lines: file and line of the rows of the log that were joined.
-        unmatched_rows: rows of both files that have no partner.
-        unneeded_rows: rows of the log that need no partner, because another row has the same point or nothing was
+        unmatched_rows: rows of both files without a matching row.
+        unneeded_rows: rows of the log that need no matching row, because another row has the same point or nothing was
             measured at their time.
         warnings: warnings, each a sentence.
     """
@@ -52,8 +52,8 @@ def join_rows(
 ) -> JoinedRows:
     """Join a list of measurements and a log of joint values.
 
-    Rows of the list keep their order; rows without a partner are left out and listed. Poses in the log are commanded
-    or calculated, so they are left out.
+    Rows of the list keep their order; rows without a matching row are left out and listed. Poses in the log are
+    commanded or calculated, so they are left out.
 
     Args:
         measured: rows without joint values.
@@ -64,7 +64,7 @@ def join_rows(
 
     Raises:
         MeasurementError: there is no column to join by, the numbers of rows differ, a name has different joint
-            values, no row has a partner, or names of points contradict the order or the time.
+            values, no row has a matching row, or names of points contradict the order or the time.
     """
     if by == "order":
         partner = _by_order(measured, joints)
@@ -101,8 +101,8 @@ def join_rows(
         rows=rows,
         joined_lines=tuple(joints.row_places[row] for row in np.unique(partner[matched])),
         unmatched_rows=(
-            *_left_out(measured, np.flatnonzero(partner < 0), f"the row has no partner in {joints.source}"),
-            *_left_out(joints, np.setdiff1d(alone, known), f"the row has no partner in {measured.source}"),
+            *_left_out(measured, np.flatnonzero(partner < 0), f"the row has no match in {joints.source}"),
+            *_left_out(joints, np.setdiff1d(alone, known), f"the row has no match in {measured.source}"),
         ),
         unneeded_rows=tuple(_left_out(joints, known, why)),
         warnings=tuple(warnings),

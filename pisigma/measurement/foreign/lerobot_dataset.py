@@ -154,7 +154,7 @@ def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
 
     Args:
         names: names of the values of a frame.
-        prefix: start of the names of this arm, such as "left_" for one arm of a pair.
+        prefix: prefix of the motor names of this arm, such as "left_" for one arm of a pair.
 
     Raises:
         MeasurementError: a motor appears twice, or the values are those of two arms and no prefix is given.
@@ -236,7 +236,7 @@ def read_joint_log(
         dataset: folder of the data set.
         units: units of the values; None if not stated.
         calibration: LeRobot's calibration file, needed for normalized values.
-        prefix: start of the names of this arm, such as "left_" for one arm of a pair.
+        prefix: prefix of the motor names of this arm, such as "left_" for one arm of a pair.
 
     Raises:
         MeasurementError: the data set cannot be read, has no joint values of this arm, the units of its values are not

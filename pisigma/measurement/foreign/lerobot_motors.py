@@ -131,7 +131,7 @@ def check_values(
         largest = float(np.abs(column).max(initial=0.0))
         if largest > limit:
             raise MeasurementError(
-                expected=f"{units} values of '{name}' within -{limit:.4g} to {limit:.4g}",
+                expected=f"{units} values of '{name}' between -{limit:.4g} and {limit:.4g}",
                 value=float(f"{largest:.6g}"),
                 at=Place(source, column=name),
                 remedy=remedy,

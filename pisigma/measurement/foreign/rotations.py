@@ -126,7 +126,7 @@ _ENCODINGS = (
     _vector("ur", "rotation vector of Universal Robots", "rx ry rz", _SPELT_OUT, "tcppose3 tcppose4 tcppose5"),
     _euler("rpy", "roll, pitch, yaw about the fixed x, y, z", "roll pitch yaw", "yaw:z pitch:y roll:x"),
     _euler("omron", "yaw, pitch, roll about z, the new y, the new z", "yaw pitch roll", "yaw:z pitch:y roll:z"),
-    _quaternion("abb", "quaternion q1 to q4, the scalar first", "q1 q2 q3 q4", "wxyz", "q0 q1 q2 q3"),
+    _quaternion("abb", "quaternion q1 to q4, scalar first", "q1 q2 q3 q4", "wxyz", "q0 q1 q2 q3"),
     _quaternion("quaternion", "quaternion x, y, z, w", "qx qy qz qw", "xyzw", "quatx quaty quatz quatw"),
     _matrix(
         "matrix",

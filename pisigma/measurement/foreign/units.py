@@ -11,7 +11,7 @@ from pisigma.files.errors import MeasurementError, nearest_choice
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
 _MIN_ROWS = 3
-"""Smallest number of rows in which small values determine their unit."""
+"""Smallest number of rows in which small values raise doubts about their unit; fewer rows may all be close to 0."""
 _MAX_DIGITS = 40
 """Largest number of digits of a converted number that is written without an exponent."""
 

@@ -244,8 +244,8 @@ def _check_wire(
     apart = f"{float((points[worst] - points[partner]).norm()) * 1e3:.4g} mm"
     raise IdentificationError(
         f"the distance {shown:g} mm from anchor '{name}' is {'shorter' if short else 'longer'} than any position of "
-        f"the anchor allows, because it is {other:g} mm in {measurements.place(int(rows[partner]))}, where the tool is "
-        f"only {apart} away",
+        f"the anchor allows, because it is {other:g} mm in {measurements.place(int(rows[partner]))}, and the two "
+        f"positions of the tool are only {apart} apart",
         at=measurements.place_of(int(rows[worst]), "distance"),
         value=shown,
         remedy="correct it, or remove the row",
@@ -277,7 +277,7 @@ class PairSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "PairSensor | None":
-        """Build the sensor from the pairs, whose rows come first and are neighbours; None if there are none."""
+        """Build the sensor from the pairs, which come first as two consecutive rows each; None if there are none."""
         data = rows.measurements
         if data.distance is None or data.pair is None:
             return None

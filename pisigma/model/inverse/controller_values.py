@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # run-time type checkers resolve the full name without this i
     import pisigma.robot.coupling
 
 MAX_STARTS = 4
-"""Largest number of stored joint values, those with the nearest poses, that are tried in sequence."""
+"""Largest number of stored joint values, those with the nearest poses, that are tried one after another."""
 _IGNORED_WEIGHT = 1e-6
 """Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control these
 rotations; they only decide between joint values that meet the other axes. The tool may then be tilted by up to

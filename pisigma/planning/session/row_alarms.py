@@ -39,7 +39,7 @@ def alarm_of_all_rows(sentence: str) -> Alarm:
 
 def withdrawn_alarm(line: int) -> Alarm:
     """Return the message that withdraws an alarm."""
-    text = f"line {line}: later rows agree with it, so the row counts after all."
+    text = f"line {line}: later rows agree with it, so the row is used again."
     return Alarm(line, "cleared", text, repeat=False, counts=True)
 
 

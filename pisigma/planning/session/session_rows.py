@@ -154,7 +154,7 @@ class SessionRows:
 def _steps(known: int, count: int) -> Iterator[int]:
     """Yield the numbers of rows after which rows are checked, if `known` rows have already been checked.
 
-    Rows are checked against the rows accepted before, so at most as many rows are added at once. Rows that are added
+    Rows are checked against the rows accepted before, so the number of rows at most doubles. Rows that are added
     together are then also checked against each other.
     """
     upto = known

@@ -77,7 +77,7 @@ class Correction(NamedTuple):
         weight: `(factors, inputs, dof)`: weights of the product units.
         bias: `(factors, dof)`: biases of the product units.
         orders: number of factors of every product unit.
-        periodic: 1 if the correction is the same on all turns, else 0.
+        periodic: 1 if the correction does not change when a joint turns by 360 deg, else 0.
         frames: 1 if a feature reads the frames of the joints, else 0.
     """
 

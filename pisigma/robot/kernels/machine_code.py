@@ -193,8 +193,8 @@ def _native_machine() -> Any:
     """Return the processor of this process, without 512-bit registers.
 
     Sums over six joints do not fill them, and the processor needs time to switch them on after a millisecond without
-    use: a pose of a UR10 hybrid took 15.3 us after such a pause and 12.3 us in a sequence, against 12.5 and 11.2 us
-        without them.
+    use: a pose of a UR10 hybrid took 15.3 us after such a pause and 12.3 us without pauses, compared with 12.5 and
+    11.2 us without these registers.
     """
     features = (
         llvm.get_host_cpu_features().flatten().replace("+avx512", "-avx512").replace("+avx10", "-avx10")

@@ -368,7 +368,7 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
 
     Raises:
         RecipeError: the robot does not reach the views.
-        OutputError: the folder exists, or cannot be written.
+        OutputError: the folder already exists, or cannot be written.
     """
     axes = robot.nominal.axes
     names = [f"q{joint + 1}_{axis.file_unit}" for joint, axis in enumerate(axes)]

@@ -72,9 +72,9 @@ def view_warnings(
     if most < _FRONTAL:
         yield _warning(
             "frontal_views",
-            f"90 % of the images show the board at less than {np.rad2deg(most):.0f} deg from frontal. Such views "
-            "hardly determine the distance and the tilt of the camera, and they double the error; take images at "
-            "up to 40 deg.",
+            f"In 90 % of the images the board is tilted by less than {np.rad2deg(most):.0f} deg relative to the camera."
+            " Such views hardly determine the distance and the tilt of the camera, and lead to 1.5 to 3 times the "
+            "error; take images with tilts of up to 40 deg.",
             tilt_deg=float(np.rad2deg(most)),
         )
     solver = closed_form_solver(robot)
@@ -103,7 +103,7 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
             yield _warning(
                 "intrinsics_fixed",
                 f"The intrinsics of camera '{camera}' were fixed at the values of its file; if these have the "
-                "errors of a typical calibration, they double the error over the workspace (0.1 mm for a UR5). "
+                "errors of a typical calibration, the error over the workspace can double. "
                 "Estimate them under their prior, or check them.",
                 camera=camera,
             )

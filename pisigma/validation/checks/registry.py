@@ -67,7 +67,7 @@ def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> 
     """Calibrate with the rows and run all checks; empty if there are too few rows for a calibration.
 
     Raises:
-        ImplausibleError: no calibration error explains the rows.
+        ImplausibleError: no geometric errors of the robot explain the rows.
         IdentificationError: the rows cannot belong to this robot.
     """
     try:

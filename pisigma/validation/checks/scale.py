@@ -174,7 +174,7 @@ _UNUSUAL = 2.0
 _EXPLAINED_BY_SCALE = 0.6
 """Largest share of the errors that may remain after correction of the factor."""
 _AS_GOOD_AS_SCALE = 1.3
-"""Factor by which the errors under every other explanation must be larger."""
+"""Smallest ratio of the errors under every other explanation to those with the factor at which it is reported."""
 _MIN_DEVIATIONS = 5.0
 """Difference of the factor from 1, in standard deviations, above which it is reported."""
 

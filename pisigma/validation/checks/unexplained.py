@@ -109,7 +109,7 @@ def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
     Half of the measured lengths must be within `plausible_error_per_reach` of the reach per axis, 1 % of most robots,
     and half of the measured angles within as many radians, which move a point at the distance of the reach equally far.
-    No calibration error exceeds these limits.
+    Geometric errors of a robot do not exceed these limits.
     """
     robot, by_images = checked.robot, "corner" in checked.rows.kinds
     share = plausible_error_per_reach(robot)
@@ -128,8 +128,8 @@ def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
                 kind="residual",
                 severity="implausible",
                 sentence=f"With the best fit, the median residual of {sensor} is still {size} per axis ({before:.3g} "
-                f"times as large for the nominal robot '{robot.name}'), more than any calibration error "
-                f"explains; check units, order, signs and zeros of the joint columns, whether {rows} belong "
+                f"times as large for the nominal robot '{robot.name}'), more than geometric errors of "
+                f"the robot explain; check units, order, signs and zeros of the joint columns, whether {rows} belong "
                 f"together, {'the lengths of the board, ' if by_images else ''}and whether this robot was "
                 "measured.",
                 cause=sensor,

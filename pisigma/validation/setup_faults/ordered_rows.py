@@ -321,10 +321,10 @@ class OrderedRows:
 def _noise_and_sizes(
     rows: OrderedRows, kind: Int64[np.ndarray, " unknowns"]
 ) -> tuple[Float64[np.ndarray, " values"], Float64[np.ndarray, " kinds"]]:
-    """Estimate the noise that is left, and the prior scales of the joint errors, in turn.
+    """Estimate the remaining noise and the prior scales of the joint errors alternately.
 
     Args:
-        rows: the rows, with the first prior scales.
+        rows: the rows, with the initial prior scales.
         kind: index of the kind of joint errors of every weight; -1 for parameters, whose prior is kept.
 
     Returns:

@@ -142,8 +142,8 @@ def unexplained_diagnostic(model: CalibratedModel) -> Diagnostic:
     return Diagnostic(
         kind="implausible_errors",
         severity="implausible",
-        sentence=f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are not calibration errors, but no usual setup "
-        "fault (frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of the joints, "
-        "correction applied twice or not at all) explains them; check whether this robot was measured, and whether the "
-        "joint values and measurements of each row belong together.",
+        sentence=f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are not geometric errors of the robot, but no "
+        "usual setup fault (frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of "
+        "the joints, correction applied twice or not at all) explains them; check whether this robot was measured, and "
+        "whether the joint values and measurements of each row belong together.",
     )

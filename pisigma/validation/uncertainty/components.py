@@ -16,7 +16,7 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary, 
 from pisigma.validation.uncertainty.budget import Component, UncertaintyBudget
 from pisigma.validation.uncertainty.instrument import Instrument
 
-SCATTER = "scatter that the model leaves"
+SCATTER = "scatter that the model does not explain"
 """Name of the component that makes a budget comparable with measured errors."""
 _POSITION = "position"
 """Sensor whose residuals are coordinates of positions."""

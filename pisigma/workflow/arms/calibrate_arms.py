@@ -145,7 +145,7 @@ class ArmsCalibration:
                 summary = self._write(scratch, command, accept_implausible)
                 if target.exists() and (not target.is_dir() or any(target.iterdir())):
                     raise OutputError(
-                        "the output exists",
+                        "the output already exists and is not empty",
                         expected="a new or empty folder",
                         at=Place(folder),
                         remedy="choose another folder",

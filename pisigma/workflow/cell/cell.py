@@ -96,7 +96,7 @@ class Cell:
             cameras: cameras and boards, whose files are copied into the cell.
 
         Raises:
-            OutputError: the folder exists and is not empty, or cannot be written.
+            OutputError: the folder already exists and is not empty, or cannot be written.
             RobotError: the robot is unknown.
             PlanningError: a value is not valid.
         """

@@ -56,7 +56,7 @@ class NewCell:
         """Write the cell into a folder that does not exist or is empty.
 
         Raises:
-            OutputError: the folder exists and is not empty, or cannot be written.
+            OutputError: the folder already exists and is not empty, or cannot be written.
             RobotError: there is no such robot.
             PlanningError: a value is not valid.
         """
@@ -65,7 +65,7 @@ class NewCell:
         target = Path(os.path.realpath(folder))
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise OutputError(
-                "the folder exists and is not empty", at=Place(folder), remedy="choose another --out"
+                "the folder already exists and is not empty", at=Place(folder), remedy="choose another --out"
             )
         try:
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -86,11 +86,11 @@ def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell
     Raises:
         PlanningError: the file is not a packed cell, is damaged, or contains links, paths that lead out of the folder
             or more than 2 GB.
-        OutputError: the folder exists or cannot be written.
+        OutputError: the folder already exists or cannot be written.
     """
     target = Path(folder)
     if target.exists() or target.is_symlink():
-        raise OutputError("the folder exists", at=Place(folder), remedy="choose another --out")
+        raise OutputError("the folder already exists", at=Place(folder), remedy="choose another --out")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with zipfile.ZipFile(path) as archive, scratch_beside(target, FOLDER) as scratch:

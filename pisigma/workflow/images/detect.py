@@ -36,8 +36,8 @@ class JoinedJoints:
 
     Attributes:
         columns: columns of the log that are kept, such as "q1_deg" and "payload_kg".
-        cells: texts of these columns by image name; images without a partner are omitted.
-        remarks: sentences about rows without a partner, and warnings.
+        cells: texts of these columns by image name; images without joint values are omitted.
+        remarks: sentences about rows without an image, and warnings.
     """
 
     columns: tuple[str, ...]
@@ -202,7 +202,7 @@ def join_joint_values(
             the file; 0 if there is no video.
 
     Raises:
-        MeasurementError: the file cannot be used, no image has a partner, or the number of stops differs from the
+        MeasurementError: the file cannot be used, no image has joint values, or the number of stops differs from the
             number of rows.
     """
     table = read_table(path)

@@ -143,7 +143,7 @@ def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
     Raises:
         RecipeError: the recipe simulates no images.
         RobotError: the robot of the recipe cannot be used.
-        OutputError: the folder exists, or cannot be written.
+        OutputError: the folder already exists, or cannot be written.
     """
     data = simulated_data(recipe)
     if not isinstance(data.training, SimulatedImages):

@@ -118,7 +118,7 @@ class CalibrationSettings:
         socket_distances: known distances [m] by the names of two sockets, such as {("*/0", "*/1"): 0.05}. An asterisk
             stands for the same text in both names, here for every placement.
         socket_sigma: standard deviation of the known distances between sockets [m]. All distances that one entry with
-            an asterisk states have the same error, because they are those of one plate.
+            an asterisk states have the same error, because the sockets are on the same plate.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Settings of the comparison of two models."""
+"""Settings for comparing two models."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -16,7 +16,7 @@ _FRAMES = {True: "fixed", False: "fitted"}
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Settings of the comparison of two models.
+    """Settings for comparing two models.
 
     Attributes:
         frames: "fixed" compares base and tool unchanged, for models measured in the same frame with the same tool;

@@ -1,4 +1,4 @@
-"""Settings of the calibration of a fleet."""
+"""Settings for calibrating a fleet."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ EngineName = Literal["processes", "ray"]
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """Settings of the calibration of a fleet.
+    """Settings for calibrating a fleet.
 
     Attributes:
         engine: where to run: processes (on this machine) or ray.

@@ -1,4 +1,4 @@
-"""Settings of the detection of boards in images, and of the calibration of a camera."""
+"""Settings for detecting boards in images, and for calibrating a camera."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,12 +10,13 @@ MaxBlur = Annotated[float, Option("--max-blur-px", min=0.0, is_key=True)]
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """Settings of the detection of boards in images.
+    """Settings for detecting boards in images.
 
     Attributes:
         max_blur: maximum blur of the edges in an image, as a standard deviation [px].
         within: maximum difference between the time stamps of an image and of its joint values [s].
-        video_start: time at which a video starts, by the clock of the joint values [s]; None if it is not known.
+        video_start: time at which a video starts, by the clock of the joint values [s]; required if
+            these have a column `time`.
     """
 
     max_blur: MaxBlur = 3.0
@@ -25,7 +26,7 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class IntrinsicsSettings:
-    """Settings of the calibration of a camera.
+    """Settings for calibrating a camera.
 
     Attributes:
         name: name of the camera.

@@ -1,4 +1,4 @@
-"""Settings of the import of exports of instruments and controllers."""
+"""Settings for importing exports of instruments and controllers."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ def parse_seconds(text: str) -> float:
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """Settings of the import of exports of instruments and controllers.
+    """Settings for importing exports of instruments and controllers.
 
     Attributes:
         maps: meaning of the columns, such as A1=q1_deg,X=x_mm,note=-, or a file written by --save-map. Columns are
@@ -51,7 +51,7 @@ class ImportSettings:
         new_frame_at: first line measured after the instrument was moved; the rows from there on are in a new frame.
         lerobot_units: units of the joint values of a LeRobot data set, degrees or normalized (-100 to 100).
         lerobot_calibration: calibration file of LeRobot with which normalized values were recorded.
-        lerobot_prefix: start of the names of the arm in a LeRobot data set of two arms, such as left_.
+        lerobot_prefix: prefix of the motor names of this arm in a LeRobot data set with two arms, such as left_.
 
     Raises:
         MeasurementError: `join` or `lerobot_units` is not a valid choice.

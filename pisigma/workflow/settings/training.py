@@ -19,7 +19,7 @@ class TrainSettings:
         show_progress: show the networks' progress bar on stderr, if that is a terminal.
         logs: folder for the metrics of every epoch (metrics.csv), and for TensorBoard if it is installed.
         jobs: number of processes that validate folds and simulations in parallel. Each uses one thread.
-            None: threads of one process.
+            None: one process with several threads.
 
     Raises:
         RecipeError: `jobs` is less than 1.

@@ -36,7 +36,7 @@ def test_the_option_once_evaluates_the_existing_rows(run, folder):
         "ALARM: line 10: the measured value is 5.",
         "line 14",
         "Next: pose",
-        "Trust: 11 rows counted, 1 left out",
+        "Trust: 11 rows used, 1 left out",
         "RMS and 95 % of the errors: predicted 0.",
         "0.001 mm",
         "poses.rest.csv",
@@ -79,7 +79,7 @@ def test_ctrl_c_ends_with_the_summary(run, folder, monkeypatch):
     monkeypatch.setattr("pisigma.workflow.follow.time", SimpleNamespace(sleep=interrupt))
     result = run("measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--set", "every=100")
     assert result.exit_code == 0, result.output
-    assert "Trust: 11 rows counted, 1 left out" in result.stdout
+    assert "Trust: 11 rows used, 1 left out" in result.stdout
 
 
 @pytest.mark.parametrize(

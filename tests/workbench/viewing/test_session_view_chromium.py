@@ -67,7 +67,7 @@ def test_rows_appear_as_they_come(browser, view):
         view.show_state(replace(session_state(arm, 20, wrong=19), base=np.eye(4)))
         shown = text_with(page, 20)
         for sentence in (
-            "20 rows (3 of them check), 1 of them not counted",
+            "20 rows (3 of them check), 1 of them not used",
             "predicted: RMS 0.224 mm, 95 % below 0.380 mm",
             "cross-validated: RMS 0.268 mm",
             "line 21: the position is off by 5 mm",

@@ -1,4 +1,4 @@
-"""Detect fits that no calibration error explains: another robot, wrong units, or swapped frame names."""
+"""Detect fits that no geometric errors of the robot explain: another robot, wrong units, or swapped frame names."""
 
 import numpy as np
 import torch
@@ -57,8 +57,8 @@ def refuse_implausible(
     if size > plausible_error_per_reach(robot) * robot.reach:
         raise ImplausibleError(
             f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis "
-            f"({100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}'), more than any calibration "
-            "error explains",
+            f"({100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}'), more than any error of "
+            "the robot explains",
             value=size,
             at=Place(source),
             remedy="check the units (millimetres in a _m column?), stated distances, order and directions of the "
@@ -81,7 +81,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
         name = problem.space.names[number]
         raise ImplausibleError(
             f"the best fit makes {name} of robot '{robot.name}' {float(fitted[number]) * 1e3:.4g} mm instead of "
-            f"{float(nominal[number]) * 1e3:.4g} mm, a difference that no calibration error explains",
+            f"{float(nominal[number]) * 1e3:.4g} mm, a difference that no error of the robot explains",
             value=name,
             at=Place(source),
             remedy="check the units (metres in a _mm column?), stated distances, order and directions of the joints, "

@@ -139,7 +139,7 @@ class ControllerFile:
     marker: str = ""
 
     def export_format(self) -> ExportFormat:
-        """Return the format of `pisigma export`."""
+        """Return the file as a format for `pisigma export`."""
         return ExportFormat(
             self.name,
             self.contents,

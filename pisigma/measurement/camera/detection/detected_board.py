@@ -62,7 +62,7 @@ class NoBoard:
     """An image without usable corners.
 
     Attributes:
-        reason: the reason as a clause, such as "no board is found in it".
+        reason: the reason as a clause, such as "no board was found in it".
         found_size: numbers of rows and columns of the corners that were found; None if no corners were found.
         is_mirrored: whether the image is mirrored.
     """

@@ -75,9 +75,9 @@ def _missing(image: Image, board: Board) -> NoBoard:
     expected = f"{board.rows} x {board.columns} corners"
     if there:
         rows, columns = piece.shape
-        reason = f"only {rows} x {columns} corners of a board of {expected} are found"
+        reason = f"only {rows} x {columns} corners of a board of {expected} were found"
         return NoBoard(reason, found_size=(rows, columns))
-    return NoBoard(f"no board of {expected} is found in it")
+    return NoBoard(f"no board of {expected} was found in it")
 
 
 DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = {

@@ -24,7 +24,7 @@ def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
     printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
     if corners is None or not len(corners):
-        return NoBoard(f"no corner of a ChArUco board with markers {board.dictionary} is found in it")
+        return NoBoard(f"no corner of a ChArUco board with markers {board.dictionary} was found in it")
     pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     return refine_corners(image, DetectedBoard(np.asarray(numbers, dtype=np.int64).ravel(), pixels), board)
 
@@ -38,7 +38,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
     number = np.zeros(0, dtype=np.int64) if numbers is None else np.asarray(numbers, dtype=np.int64).ravel()
     used = np.flatnonzero((number < board.rows * board.columns) & (np.bincount(number)[number] == 1))
     if not len(used):
-        return NoBoard(f"no AprilTag of family {board.dictionary} of the board is found in it")
+        return NoBoard(f"no AprilTag of family {board.dictionary} of the board was found in it")
     tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
     for _ in range(_ITERATIONS):
         tags = _crossings(image, tags, board.clearance)
