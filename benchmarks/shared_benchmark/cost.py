@@ -35,7 +35,7 @@ def total_text(results: Results) -> str:
     text = (
         f"The {len(fits)} stored fits need {_minutes(fits):.0f} min on two free cores, those of `run --quick` "
         f"{_minutes([fit for fit in fits if _is_quick(fit)]):.1f} min; this is their processor time, with "
-        f"{START_S} s for the start of every process and {LIMIT_S} s for each of {sum(map(_overran, fits))} overruns."
+        f"{START_S} s for the start of every process and {LIMIT_S} s for every overrun ({sum(map(_overran, fits))})."
     )
     if waits:
         text += (

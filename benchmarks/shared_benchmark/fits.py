@@ -125,7 +125,7 @@ def fits_of(
         method: the method.
         python: Python that runs the method.
         folds: number of folds to run, starting with the first; None for all.
-        below: number of training rows from which on folds are not tried because a fit overran; an overrun lowers it.
+        below: smallest number of training rows of folds that are not tried because a fit overran; an overrun lowers it.
     """
     inputs = inputs_of(series, split, method)
     for number, fold in enumerate(folds_of(series, split)[:folds]):

@@ -31,7 +31,7 @@ def _numbers(pairs: object) -> list[Fold]:
 
 
 def _random(data: Measurements) -> list[Fold]:
-    """Return five random folds; rows of equal joint values stay together."""
+    """Return five random folds; rows with equal joint values stay together."""
     return _numbers(k_folds(data, 5, SEED))
 
 

@@ -1,4 +1,4 @@
-"""Groups of rows that belong together: rows of equal joint values, of a pair, or of a placement."""
+"""Groups of rows that belong together: rows with equal joint values, of a pair, or of a placement."""
 
 from collections.abc import Hashable, Sequence
 
@@ -66,7 +66,8 @@ def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Return the index of the group that a split must keep together, for every row.
 
-    Rows of equal joint values belong together, as do the two rows of a pair and all rows that belong to either of them.
+    Rows with equal joint values belong together, as do the two rows of a pair and all rows that belong to either of
+    them.
 
     Args:
         measurements: the rows.

@@ -119,8 +119,8 @@ class GrowingFile:
             return ()
         what = "truncated" if self._text.startswith(text) else "replaced"
         return (
-            f"{self._source} was {what}. The {self._accepted.total()} rows that were read so far still count and are "
-            "not read again; restart the session if they should no longer count.",
+            f"{self._source} was {what}. The {self._accepted.total()} rows that have been read are still used and "
+            "are not read again; restart the session if they should no longer be used.",
         )
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:

@@ -1,4 +1,4 @@
-"""Split measurements into training and held-out rows, keeping rows of equal joint values or of a pair together."""
+"""Split measurements into training and held-out rows; rows with equal joint values, or of a pair, stay together."""
 
 import heapq
 from collections.abc import Sequence
@@ -211,7 +211,7 @@ def holdout(
 
 
 def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _sampled"]:
-    """Draw rows at random; rows of equal joint values or of a pair are drawn together.
+    """Draw rows at random; rows with equal joint values, or of a pair, are drawn together.
 
     With the same seed, a smaller draw is a subset of every larger one.
 

@@ -174,8 +174,8 @@ def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diag
     remedy = (
         "check the names and joint values of both rows, and that both tips were at rest"
         if disagreement.shared.kind == TOUCH
-        else "check that it was not moved between the measurements of the arms, that its name is right in all rows, "
-        "and the rows of both arms"
+        else "check that it was not moved between the measurements of the arms, and that its name is right in "
+        "all rows, and check the rows of both arms"
     )
     return Diagnostic(
         kind="arms",

@@ -254,7 +254,7 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByFram
 
 
 def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:
-    """Test the dependence of errors on a joint's values; rows of equal joint values count once."""
+    """Test the dependence of errors on a joint's values; rows with equal joint values count once."""
     if len(errors) < 3 or np.ptp(values) == 0:
         return "joint not moved"
     bins = bin_errors(values, errors)

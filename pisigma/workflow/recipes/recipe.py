@@ -53,7 +53,7 @@ class MeasuredData(Section):
 
     Attributes:
         kind: "measured".
-        folds: number of folds of the cross-validation. Rows of equal joint values are in the same fold.
+        folds: number of folds of the cross-validation. Rows with equal joint values are in the same fold.
         seed: random seed of the folds.
     """
 
