@@ -153,7 +153,7 @@ class FitResiduals:
         return total
 
     def _share(self, name: str, size: float, factor: float) -> float:
-        """Return the share of the squared residuals that a cause explains with its most probable unknowns."""
+        """Return the share of the squared residuals that a cause with its most probable values explains."""
         Z = size * self.causes[name]
         part = Z @ Z.t()
         explained = part @ torch.linalg.solve(self._total(factor) + part, self.y)

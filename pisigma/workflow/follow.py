@@ -1,4 +1,4 @@
-"""Follow a growing file: check rows at once, and update the accuracy in another process."""
+"""Check the rows of a growing file as they arrive, and update the accuracy in another process."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -276,7 +276,7 @@ class _Zero:
 
 
 def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
-    """Forecast when the RMS error of a session passes a limit, from a straight line through all sessions."""
+    """Forecast when the RMS error of a session exceeds a limit, from a straight line through all sessions."""
     months, last = months_of(records), records[-1]
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
     exceeded = bool(rms[-1] > limit_mm)

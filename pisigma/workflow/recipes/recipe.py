@@ -222,7 +222,8 @@ class HybridRecipe(AbstractRecipe):
         not_validated: limits of the validation, for the card of the model.
         robot: catalogue name or robot file of the nominal robot.
         data: source of the measurements. Measured rows are validated in folds, simulated rows on held-out rows.
-        repeats: number of repeats of a simulation, each with all seeds one higher. The model is from the first repeat.
+        repeats: number of repeats of a simulation, each with all seeds increased by one. The model is from the first
+            repeat.
         calibration: settings of the geometric calibrator.
         hybrid: settings of the hybrid calibrator.
         learning_curve: learning curve to compute, null for none.

@@ -31,7 +31,7 @@ class ActiveFrames:
     A value is certain if all paths through the program lead to it. A value that is set in a loop or a branch is certain
     after its statement in that block, but neither after the block nor earlier in the same loop. Values that a called
     routine sets are uncertain, as are values at the start of a routine if the program sets them in several places. A
-    routine of another file may set all values.
+    routine in another file may set all values.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
@@ -90,7 +90,7 @@ class ActiveFrames:
             )
         elif step.kind == "call":
             where = "is" if step.name in self._set_by else "may be"
-            whose = "" if step.name in self._set_by else " of another file"
+            whose = "" if step.name in self._set_by else " in another file"
             for name in self._set_at(step_index):
                 self._values[name] = f"{name} {where} set by the routine {step.name}{whose}"
         elif step.kind == "else" and self._saved:
@@ -148,7 +148,7 @@ class ActiveFrames:
         return jumps and sum(self._steps[number].name in self._set_at(other) for other in inside) > 1
 
     def _set_at(self, number: int) -> set[str]:
-        """Return the names that a step sets, directly or by a call; a routine of another file may set all names."""
+        """Return the names that a step sets, directly or by a call; a routine in another file may set all names."""
         step = self._steps[number]
         if step.kind == "set":
             return {step.name}

@@ -68,7 +68,7 @@ class _Reader:
     redefined: list[re.Match[str]] = field(default_factory=list)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     call: re.Match[str] | None = None
-    """First call of a routine of another file; `uncertain` is the position after which frames are uncertain."""
+    """First call of a routine in another file; `uncertain` is the position after which frames are uncertain."""
     uncertain: float = math.inf
 
     def read(self) -> ScannedProgram:
@@ -133,7 +133,7 @@ class _Reader:
             return f"the program sets {kind} {index}"
         name = f"{kind} {index}"
         if self.call and position > self.uncertain:
-            return f"{name} may be set by the routine {self.call[1]} of another file"
+            return f"{name} may be set by the routine {self.call[1]} in another file"
         return self.stated.frame(name) if kind == "UFRAME" else self.stated.tool(name)
 
     def _pose(self, name: str) -> Pose | str:

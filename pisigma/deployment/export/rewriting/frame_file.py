@@ -39,7 +39,7 @@ class FrameFile(Section):
         return _lookup(self.frames, name, "frame")
 
     def sets_no_frame(self, routine: str) -> bool:
-        """Return whether a routine of another file is stated to set neither frame nor tool."""
+        """Return whether a routine in another file is stated to set neither frame nor tool."""
         return routine.upper() in map(str.upper, self.routines)
 
     def tool(self, name: str) -> Float64[Tensor, "4 4"] | str:

@@ -142,7 +142,7 @@ class _Reader:
             called = (
                 "a routine that is named at run time"
                 if name == "%"
-                else f"the routine {match['name']} of another file"
+                else f"the routine {match['name']} in another file"
             )
             return f"tool and work object may be set by {called} (line {self.scan.line_number(match.start('name'))})"
         return ""

@@ -277,7 +277,7 @@ def test_invalid_quaternions_are_reported_with_their_lines(quaternion):
 
 
 def test_the_tool_of_a_called_routine_is_uncertain():
-    """The program, or a routine of another file, may set another tool before the call."""
+    """The program, or a routine in another file, may set another tool before the call."""
     frames = FrameFile.model_validate({"tools": {"tcp": {"z_mm": 50}}})
     text = "def cell():\n{}{}\nend\n"
     sub = f"def sub():\n{MOVE}\nend\n"
