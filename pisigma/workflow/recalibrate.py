@@ -150,10 +150,12 @@ def recalibrate(
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
-    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.wrong_row_indices)
+    rows, adaptation, outliers = _adapted(parent, posterior, every, elsewhere, right.wrong_row_indices)
     consistency = _fleet_consistency(parent, rows)
     if consistency is not None and consistency.class_share > 0:
-        adaptation = adapt(recalibration_problem(parent, consistency.widened(posterior), rows, elsewhere))
+        # The narrow prior may have rejected rows that are right for a robot unlike its fleet.
+        wide = consistency.widened(posterior)
+        rows, adaptation, outliers = _adapted(parent, wide, every, elsewhere, right.wrong_row_indices)
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, with_stage(progress, "cross-validation")

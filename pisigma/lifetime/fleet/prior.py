@@ -193,10 +193,18 @@ def _correction(
 
 
 def evidence_of(
-    model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements
+    model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements, class_share: float = 0.0
 ) -> RobotEvidence:
-    """Compute the information of a robot's rows, linearised at its most probable errors."""
-    posterior = ModelPosterior.from_model(model)
+    """Compute the information of a robot's rows, linearised at its most probable errors.
+
+    Args:
+        model: mean robot of a fleet.
+        mean: mean of the unknowns [m or rad].
+        rows: rows of the robot.
+        class_share: multiple of the covariance of the robot's class by which the prior is widened while the most
+            probable errors, the noise and the wrong rows are found.
+    """
+    posterior = _widened(ModelPosterior.from_model(model), class_share)
     rows = posterior.with_model_names(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
@@ -215,6 +223,20 @@ def evidence_of(
     normal = (normal + normal.t()) / 2
     # Linearised at the mean, the residuals determine the errors minus the mean, so the mean is added.
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
+
+
+def _widened(prior: ModelPosterior, class_share: float) -> ModelPosterior:
+    """Return the prior with a multiple of the covariance of the robot's class added."""
+    if not class_share:
+        return prior
+    space, usual = prior.space, robot_class_population(prior.space.robot)
+    deviation = (class_share * usual.covariance.diagonal()).sqrt().diag()
+    between = prior.covariance_root.new_zeros(
+        (len(space.parameters) - space.arm_parameter_count, len(deviation))
+    )
+    arm, weights = deviation[: space.arm_parameter_count], deviation[space.arm_parameter_count :]
+    added = torch.cat([arm, between, weights])
+    return replace(prior, covariance_root=torch.cat([prior.covariance_root, added], 1))
 
 
 def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
@@ -262,7 +284,8 @@ class FleetConsistency:
         nominal = posterior.space.robot
         errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])
-        evidence = evidence_of(model, mean, rows)
+        # Rows that a robot of the fleet cannot have may be right for a robot unlike it.
+        evidence = evidence_of(model, mean, rows, class_share=_CLASS_SHARES[-1])
         fleet = Population(mean, root @ root.t(), posterior.space.arm_parameter_count)
         square, count = fleet.squared_distance(evidence)
         usual = robot_class_population(nominal)
@@ -276,14 +299,7 @@ class FleetConsistency:
 
     def widened(self, prior: ModelPosterior) -> ModelPosterior:
         """Return the prior with this multiple of the covariance of the robot's class added."""
-        space, usual = prior.space, robot_class_population(prior.space.robot)
-        deviation = (self.class_share * usual.covariance.diagonal()).sqrt().diag()
-        between = prior.covariance_root.new_zeros(
-            (len(space.parameters) - space.arm_parameter_count, len(deviation))
-        )
-        arm, weights = deviation[: space.arm_parameter_count], deviation[space.arm_parameter_count :]
-        added = torch.cat([arm, between, weights])
-        return replace(prior, covariance_root=torch.cat([prior.covariance_root, added], 1))
+        return _widened(prior, self.class_share)
 
     @property
     def is_inconsistent(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from testing.fleet_robots import NOMINAL, common_errors, rows_of
+from testing.fleet_robots import INDIVIDUAL, NOMINAL, common_errors, rows_of
 from testing.models import no_type_checker
 from testing.refusals import refused
 
@@ -84,6 +84,15 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
     widened = replace(prior.model, uncertainty=replace(prior.model.uncertainty, covariance_root=root))
     with no_type_checker():
         assert not FleetConsistency.from_rows(widened, few.select(torch.arange(8))).is_inconsistent
+
+
+def test_right_rows_of_a_robot_unlike_its_fleet_are_used(prior):
+    """Its individual errors are five times those of the fleet."""
+    rows = rows_of(81, 8, 81, individual=5 * INDIVIDUAL)
+    with no_type_checker():
+        begun = recalibrate(prior.model, rows)
+    assert begun.summary.outliers == ()
+    assert begun.adaptation.values.configuration.unique().numel() == rows.rows
 
 
 def test_expectation_maximisation_finds_a_population():
