@@ -16,7 +16,7 @@ LOSSES: Mapping[tuple[str, str], str] = {}
 BELOW_GEOMETRIC: Mapping[tuple[str, str], str] = {
     ("fr3", "placements"): (
         "only one of the three fits keeps a correction, that without placement B. Its two placements are too few to be "
-        "left out, so the correction is accepted by errors of left-out rows whose sockets keep their other rows. "
+        "left out, so the correction is judged by left-out rows of sockets whose other rows are fitted. "
         "It has 90 effective unknowns for 60 rows, and joint 6 leaves its measured range by 34 deg."
     ),
 }

@@ -113,7 +113,7 @@ def _check(request: ExportRequest) -> None:
         )
     elif request.frames is not None or request.tolerance_mm is not None:
         option = "--frames" if request.frames is not None else "--tolerance-mm"
-        raise OutputError("the option applies only to a --program", option=option, remedy="omit it")
+        raise OutputError("the option applies only with --program", option=option, remedy="omit it")
 
 
 def _check_options(request: ExportRequest) -> None:

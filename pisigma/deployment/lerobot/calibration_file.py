@@ -28,9 +28,9 @@ _NOT_EXPRESSED = (
     "Zeros are rounded to half a tick (0.04 deg). One end of a range is moved inwards by twice the offset, so that the "
     "motor stays within the range that was recorded; homing_offset is unchanged.",
     "The directions of the joints (drive_mode) are unchanged: LeRobot ignores drive_mode for degrees.",
-    "The file holds for use_degrees=true. Values of -100 to 100 have another scale with another range: correct the "
-    "frames of such policies and data sets with pisigma.LeRobotCorrection instead.",
-    "The file holds for the calibration file with which the rows of the model were recorded: LeRobot's calibration "
+    "The file is valid only for use_degrees=true. The scale of values from -100 to 100 depends on the range: correct "
+    "the frames of such policies and data sets with pisigma.LeRobotCorrection instead.",
+    "The file replaces only the calibration file with which the rows of the model were recorded: LeRobot's calibration "
     "sets other zeros, so calibrate again after it.",
     "Use either this file or corrected frames, not both: the correction would be applied twice.",
 )

@@ -86,7 +86,7 @@ def unplanned_joint_alarms(
         if most <= NEAR_POSE:
             text = (
                 f"joint '{name.name}' differs by {most:.2f} {name.file_unit} from its value in {names[pose]}; the row "
-                "counts at its own joint values."
+                "is used at its own joint values."
             )
         else:
             text = _in_other_unit(robot, rows.q[row : row + 1], poses, names) or (

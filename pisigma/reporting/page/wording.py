@@ -105,8 +105,8 @@ def arm_sentence(arm: ArmInImages) -> str:
     )
     remark = f" The calibrated arm was fitted to {fitted}; errors in new images are larger."
     return (
-        f"In {len(arm.images)} images, the board is {before:.3g} mm RMS from where the nominal arm says (base and tool "
-        f"fitted), and {after:.3g} mm from where the calibrated arm says; the error is {change}."
+        f"In {len(arm.images)} images, the board is {before:.3g} mm RMS from where the nominal arm predicts it (base "
+        f"and tool fitted), and {after:.3g} mm from where the calibrated arm predicts it; the error is {change}."
         f"{remark if arm.training_images else ''}"
     )
 

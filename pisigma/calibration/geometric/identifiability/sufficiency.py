@@ -273,7 +273,7 @@ def _scale_of_boards(setup: CalibrationSetup) -> str:
     )
     return (
         "only the board determines the scale: if its squares are 0.1 % too large, so is the robot, and no residual "
-        f"shows it; {how_sure}. Measure the board with a calliper, or one known distance with another sensor."
+        f"shows it; {how_sure}. Measure the board with a calliper, or measure one known distance with another sensor."
     )
 
 
