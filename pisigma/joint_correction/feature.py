@@ -96,6 +96,10 @@ class AbstractFeature(ABC):
             state: joint values [rad or m], and further data of the rows.
         """
 
+    def columns_of_rows(self, state: JointState) -> Float64[Tensor, "rows dof columns"]:
+        """Return the columns of measured rows, which may be stored: no derivative passes through them."""
+        return self.columns(state)
+
     def unstated_covariance_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:

@@ -1,5 +1,6 @@
 """Feature for gravity torques of unknown masses, which deflect compliant joints and gears."""
 
+from functools import lru_cache
 from typing import Any, Literal, no_type_check
 
 import numpy as np
@@ -16,6 +17,8 @@ from pisigma.robot.kernels.forms import CompiledForm
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 
 Direction = tuple[float, float, float]
+_STORED_ROWS = 1_000
+"""Largest number of rows whose columns are stored."""
 
 
 class GravitySection(FeatureSection):
@@ -124,6 +127,13 @@ class GravityTorques(AbstractFeature):
         cells = torch.where(turning, cells, force) * self.used.to(q).view(*cells.shape[:3], 1)
         return cells.flatten(1, 2).movedim(-1, 0).reshape(*q.shape, 4 * self.robot.dof)
 
+    def columns_of_rows(self, state: JointState) -> Float64[Tensor, "rows dof columns"]:
+        """Return the columns of measured rows, stored because a calibration needs those of the same rows many times."""
+        q = state.q
+        if q.requires_grad or q.device.type != "cpu" or not 0 < len(q) <= _STORED_ROWS:
+            return self.columns(state)
+        return _stored_columns(self.robot, self.gravity, q.numpy().tobytes())
+
     def _frames(self, q: Float[Tensor, "poses dof"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return axis and origin of every joint, and origin and axes of its row's frame; the pose index is last."""
         geometry = Geometry(self.robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
@@ -160,3 +170,10 @@ class GravityTorques(AbstractFeature):
         torques = node("Mul", node("Sub", cells, node("Mul", own, origin)), scale * weight * turns[:, None])
         force = node("Mul", graph.add_sum(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
         return node("Add", graph.add_sum(torques, 2), force)
+
+
+@lru_cache(maxsize=32)
+def _stored_columns(robot: Robot, gravity: Direction, q: bytes) -> Float64[Tensor, "rows dof columns"]:
+    """Return the columns of the feature at joint values [rad or m], which are the bytes of an array `(rows, dof)`."""
+    rows = torch.from_numpy(np.frombuffer(q).reshape(-1, robot.dof).copy())
+    return GravityTorques(robot, gravity).columns(JointState(rows))

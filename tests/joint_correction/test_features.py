@@ -164,6 +164,18 @@ def test_masses_before_a_joint_have_no_weight():
     assert int(features.used[3].sum()) == 4
 
 
+def test_columns_of_the_same_rows_are_computed_once():
+    robot = arm()
+    q, known = joints(robot, 5), []
+    for gravity in (GRAVITY, (0.0, 1.0, 0.0)):
+        feature = GravityTorques(robot, gravity)
+        for values in (q, q[:3], q.flip(0)):
+            known.append(feature.columns_of_rows(JointState(values)))
+            assert torch.equal(known[-1], feature.columns(JointState(values)))
+            assert GravityTorques(robot, gravity).columns_of_rows(JointState(values.clone())) is known[-1]
+    assert len({one.data_ptr() for one in known}) == len(known)
+
+
 def test_gravity_torques_do_not_depend_on_base_and_tool():
     robot = arm()
     bare = robot.with_geometry(base=np.zeros(6))

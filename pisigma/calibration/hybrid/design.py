@@ -67,7 +67,7 @@ class Design:
             weight = (
                 torch.zeros(chosen.used.shape).to(x).masked_scatter(chosen.used, x[self.weights_of(number)])
             )
-            total = total + (chosen.columns(state) * weight).sum(-1)
+            total = total + (chosen.columns_of_rows(state) * weight).sum(-1)
         return total
 
     def predicted_change(

@@ -221,7 +221,7 @@ def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -
 def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "rows dof columns"]:
     """Compute the columns of all features at rows of the problem, including columns that a joint does not use."""
     state = design.problem.state[row]
-    return torch.cat([chosen.columns(state) for chosen in design.features], -1)
+    return torch.cat([chosen.columns_of_rows(state) for chosen in design.features], -1)
 
 
 def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:

@@ -173,7 +173,7 @@ def weight_columns(
         state: joint state of every row.
     """
     used = feature.used.flatten()
-    block = (joints[..., None] * feature.columns(state)[:, None]).flatten(2)
+    block = (joints[..., None] * feature.columns_of_rows(state)[:, None]).flatten(2)
     return block if bool(used.all()) else block[..., used]
 
 

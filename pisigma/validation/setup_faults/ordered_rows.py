@@ -184,9 +184,10 @@ class OrderedRows:
     def jacobian(self) -> Float64[np.ndarray, "rows values unknowns"]:
         """Derivative with respect to the calibration's parameters, and the weights of joint errors."""
         by_weights = [
-            (self.joint_derivative[..., None] * feature.columns(self.problem.state).cpu().numpy()[:, None])[
-                ..., used
-            ]
+            (
+                self.joint_derivative[..., None]
+                * feature.columns_of_rows(self.problem.state).cpu().numpy()[:, None]
+            )[..., used]
             for feature, used, _ in self._joint_errors
         ]
         return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], *by_weights], 2)
