@@ -58,7 +58,7 @@ def fitted(
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
     view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)
-    x[: design.active_count] = (solved.solution.linearisation.point - problem.nominal)[problem.active]
+    x[: design.active_count] = (solved.solution.linearisation.point - problem.prior_mean)[problem.active]
     noise, sizes = tuple(view.noise.tolist()), prior or design.prior(view.prior_scale.tolist())
     effective = float(design.active_count)
     for _ in range(ROUNDS):
@@ -78,7 +78,7 @@ def fitted(
     fit = build_regression(design, rows)
     there = fit.solve(posterior.prior, posterior.noise)
     there = fit.solve(posterior.prior, fit.updated_noise(there))
-    point = problem.nominal.index_add(0, problem.active, there.x[: design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, there.x[: design.active_count])
     return RefinedFit(rows, design, there, fit, point, correction_from_weights(design, there.x), ROUNDS)
 
 

@@ -140,7 +140,10 @@ def bound(true: Robot, rows: Measurements, q: Tensor) -> float:
     everything = torch.tensor(unknown)
     here, unknowns = slice(0, rows.rows), problem.space.sensor_unknowns(point)
     motion = problem.motion(point, here, everything)
-    blocks = [problem.derivative(sensor, motion, unknowns, here, everything) for sensor in problem.sensors]
+    blocks = [
+        problem.prediction_derivative(sensor, motion, unknowns, here, everything)
+        for sensor in problem.sensors
+    ]
     J = torch.cat([block.flatten(1) for block in blocks], 1)
     noise = float(torch.as_tensor(rows.readings["corner_noise"])[0])
     scale = torch.from_numpy(problem.space.usual_errors)[everything, None]

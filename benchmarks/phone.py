@@ -53,7 +53,9 @@ PHONE = Camera("phone", 1920, 1440, 1420.0, 1425.0, 965.0, 712.0, 0.06, -0.12, 3
 BOARD = {"kind": "charuco", "rows": 4, "columns": 6, "square_mm": 18, "marker_mm": 13, "dictionary": "4x4_50"}
 MOTION = np.array([1e-3] * 3 + [np.deg2rad(0.2)] * 3) / 3**0.5
 """Motion of the board while an image is read out [m and rad]; every component has a random sign."""
-LIGHT = Exposure(blur=1.0, focus=0.6, aperture=0.002, vignetting=0.3, gradient=0.5, noise=4.0)
+LIGHT = Exposure(
+    blur_in_focus=1.0, focus_distance=0.6, aperture_diameter=0.002, vignetting=0.3, gradient=0.5, noise=4.0
+)
 OBLIQUE, NEAREST = np.deg2rad(50), 0.25
 CANDIDATES, POSES, OTHERS = 8, 400, 4000
 IDENTIFIABLE = slice(1, 4)
@@ -199,7 +201,9 @@ def drawn(
     image = np.full((PHONE.height + 2 * height, PHONE.width + 2 * width), 110, dtype=np.float32)
     image[top + height : top + 2 * height, left + width : left + 2 * width] = patch
     image = image[height:-height, width:-width]
-    image = cv2.GaussianBlur(image, (0, 0), LIGHT.blur) * np.linspace(0.5, 1.0, PHONE.width, dtype=np.float32)
+    image = cv2.GaussianBlur(image, (0, 0), LIGHT.blur_in_focus) * np.linspace(
+        0.5, 1.0, PHONE.width, dtype=np.float32
+    )
     noisy: np.ndarray = image + LIGHT.noise * rng.standard_normal(image.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 

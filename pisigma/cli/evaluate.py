@@ -87,7 +87,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
 
     rows = evaluation.rows
     errors = ", ".join(f"{one.name} {model_rms_text(one, rows)}" for one in evaluation.models)
-    fitted = [name for name, one in evaluation.evaluated_models.items() if one.trained_on]
+    fitted = [name for name, one in evaluation.model_descriptions.items() if one.trained_on]
     kind = f"; fit of {' and '.join(fitted)}, which these rows calibrated" if fitted else ""
     verdict = Verdict(
         f"RMS of {rows} rows: {errors}{kind}.",

@@ -17,7 +17,7 @@ from pisigma.estimation.drift import (
     DriftGroup,
     LinearValues,
     compressed_columns,
-    evidence_coordinates,
+    diagonalise_evidence,
     evidence_gains,
 )
 
@@ -132,7 +132,7 @@ class FitResiduals:
                 evidence[row] -= 0.5 * (math.log(factor) / _STATED_SPREAD) ** 2
             for name, Z in self.causes.items():
                 W = torch.linalg.solve_triangular(L, Z, upper=False)
-                gains[name][row] = evidence_gains(_SIZES, *evidence_coordinates(W, a))
+                gains[name][row] = evidence_gains(_SIZES, *diagonalise_evidence(W, a))
         nothing = float(evidence.logsumexp(0))
         causes = []
         for name, gain in gains.items():
@@ -364,7 +364,7 @@ class SessionEvidence:
         raised[single] = evidence_gains(_TRIED[:, None], eigenvalues[:, None], squares[:, None]).t()
         blocks = torch.split(W, widths.tolist(), 1)
         for number in (~single).nonzero()[:, 0].tolist():
-            raised[number] = evidence_gains(_TRIED, *evidence_coordinates(blocks[number], a))
+            raised[number] = evidence_gains(_TRIED, *diagonalise_evidence(blocks[number], a))
         return raised
 
     def _noise(self, noise_factor: float) -> Float64[Tensor, " values"]:

@@ -205,7 +205,7 @@ class DriftSearch:
     def _coordinates(self, number: int) -> tuple[Tensor, Tensor]:
         """Return the eigenvalues of a group's covariance in the metric of the other terms, and squared coordinates."""
         _, a, W = self._whitened(number)
-        return evidence_coordinates(W, a)
+        return diagonalise_evidence(W, a)
 
     def _whitened(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """Return a group's columns, and values and columns in the metric of all other terms."""
@@ -245,13 +245,14 @@ class DriftSearch:
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
 
-def evidence_coordinates(
-    W: Float64[Tensor, "values columns"], a: Float64[Tensor, " values"]
+def diagonalise_evidence(
+    whitened_columns: Float64[Tensor, "values columns"], whitened_values: Float64[Tensor, " values"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-    """Return the eigenvalues of a group's covariance and the squared coordinates of whitened values a."""
-    eigenvalues, U = torch.linalg.eigh(W.t() @ W)  # several times as fast as the singular values of W
+    """Return the eigenvalues of a group's covariance and the squared coordinates of the values in its axes."""
+    # several times as fast as the singular values of the columns
+    eigenvalues, U = torch.linalg.eigh(whitened_columns.t() @ whitened_columns)
     eigenvalues = eigenvalues.clamp(min=1e-15 * float(eigenvalues[-1]) + 1e-300)
-    return eigenvalues, (U.t() @ (W.t() @ a)).square() / eigenvalues
+    return eigenvalues, (U.t() @ (whitened_columns.t() @ whitened_values)).square() / eigenvalues
 
 
 def evidence_gains(

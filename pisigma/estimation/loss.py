@@ -21,14 +21,17 @@ Scalar = Float[Tensor, ""] | float
 
 
 class AbstractLoss(ABC):
-    """Cost of a row as a function of its distance in standard deviations; `components` is the number of values."""
+    """Cost of a row as a function of its relative length, the length of its residual in standard deviations.
+
+    `components` is the number of values of a row.
+    """
 
     @abstractmethod
-    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return the cost of every row, the squared length for small distances."""
 
     @abstractmethod
-    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return the least-squares weight of every row: half the derivative of the cost divided by the length."""
 
     @abstractmethod
@@ -65,13 +68,13 @@ class AbstractLoss(ABC):
 class SquaredLoss(AbstractLoss):
     """Plain least squares."""
 
-    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return the squared length."""
-        return residual_length.square()
+        return relative_length.square()
 
-    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return 1 for every row."""
-        return torch.ones_like(residual_length)
+        return torch.ones_like(relative_length)
 
     def scale(
         self, residual_length: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
@@ -102,20 +105,20 @@ class HampelLoss(AbstractLoss):
     being wrong.
     """
 
-    def cost(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return the cost of every row: a square, line, parabola or constant, depending on the length."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        straight, bent = residual_length.clamp(a, c).sub_(a), residual_length.clamp(b, c).sub_(b)
-        cost: Tensor = residual_length.clamp(max=a).square_().add_(straight, alpha=2 * a)
+        straight, bent = relative_length.clamp(a, c).sub_(a), relative_length.clamp(b, c).sub_(b)
+        cost: Tensor = relative_length.clamp(max=a).square_().add_(straight, alpha=2 * a)
         return cost.addcmul_(bent, bent, value=-a / (c - b))
 
-    def weight(self, residual_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, relative_length: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Return the weight of every row: 1, a / length, a decreasing function or 0, depending on the length."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        falling: Tensor = torch.rsub(residual_length, c).div_(c - b).clamp_(0, 1)
-        return falling.mul_(a).div_(residual_length.clamp(min=a))
+        falling: Tensor = torch.rsub(relative_length, c).div_(c - b).clamp_(0, 1)
+        return falling.mul_(a).div_(relative_length.clamp(min=a))
 
     def scale(
         self, residual_length: Float[Tensor, " rows"], components: int, effective_parameters: Scalar

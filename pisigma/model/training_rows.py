@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.copies import RowValues, copies_of_known, places_text
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import with_limits_of_rows
+from pisigma.measurement.exceeded_limits import with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import rows_at_starts
 from pisigma.robot.description import Robot

@@ -13,7 +13,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.csv.reading import contains_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_sight import BoardSight

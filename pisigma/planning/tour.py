@@ -53,7 +53,7 @@ class Pace:
             expected, value = f"a settling time of 0 to {_MAX_SETTLING:g} s", f"{self.settling:g} s"
             raise PlanningError(expected=expected, value=value, option="settling")
 
-    def duration(
+    def motion_duration(
         self, robot: Robot, start: Float64[Tensor, "*#batch dof"], end: Float64[Tensor, "*#batch dof"]
     ) -> Float64[Tensor, "*_batch"]:
         """Compute the duration of joint motions [s], determined by the slowest joint, without acceleration."""
@@ -101,7 +101,7 @@ def plan_tour(
             poses, then the next 20, then the others, each stage in an order of short duration.
     """
     poses = q if start is None else torch.cat([start[None], q])
-    seconds = pace.duration(motions.arm.robot, poses[:, None], poses[None]).numpy()
+    seconds = pace.motion_duration(motions.arm.robot, poses[:, None], poses[None]).numpy()
     first = int(start is not None)
     order = np.arange(first)
     ends = [*(end for end in stages if end < len(q)), len(q)]
@@ -208,7 +208,7 @@ def _with_waypoints(
             before.append(points)
     path = torch.cat([torch.cat([points, poses[[stop]]]) for stop, points in zip(stops, before, strict=True)])
     first = int(fixed_start)
-    seconds = float(pace.duration(motions.arm.robot, path[:-1], path[1:]).sum())
+    seconds = float(pace.motion_duration(motions.arm.robot, path[:-1], path[1:]).sum())
     return Tour(
         torch.tensor(stops[first:], dtype=torch.int64) - first,
         tuple(before[first:]),

@@ -12,7 +12,7 @@ from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import number_text
 from pisigma.validation.held_out.calibration_summary import (
     CalibrationSummary,
-    HybridFigures,
+    JointCorrectionFigures,
     NoiseFigures,
     ParameterFigures,
     ScaleFigures,
@@ -92,7 +92,7 @@ def implausible_lines(summary: CalibrationSummary) -> list[str]:
     return [one.sentence for one in summary.diagnostics if one.severity == "implausible"]
 
 
-def trial_table(hybrid: HybridFigures) -> Table:
+def trial_table(hybrid: JointCorrectionFigures) -> Table:
     """Return a table of the joint corrections that were tried, in order."""
     rows = [
         (
@@ -108,7 +108,7 @@ def trial_table(hybrid: HybridFigures) -> Table:
     return Table(TRIAL_COLUMNS, tuple(rows))
 
 
-def learned_lines(hybrid: HybridFigures) -> list[str]:
+def learned_lines(hybrid: JointCorrectionFigures) -> list[str]:
     """Return sentences on the learned joint correction."""
     return list(_say("learned", hybrid))
 

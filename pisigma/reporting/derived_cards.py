@@ -19,7 +19,7 @@ from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import number_text
 from pisigma.reporting.verdict import rounded_text
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
-from pisigma.validation.held_out.frame_summary import FrameSummary
+from pisigma.validation.held_out.frame_calibration_summary import FrameCalibrationSummary
 
 _CANDIDATES = {
     "recalibrated": "recalibrated",
@@ -42,7 +42,7 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
     )
 
 
-def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
+def write_frame_card(model: CalibratedModel, summary: FrameCalibrationSummary, folder: Path) -> None:
     """Write the card of a model with a calibrated frame or tool into the model folder.
 
     Args:

@@ -11,7 +11,7 @@ from pisigma.reporting.result_text import ResultText, Table, sentence_block, tab
 from pisigma.reporting.verdict import Verdict, count_text, rounded_text
 from pisigma.validation.held_out.arms_summary import ArmBaseFigures, ArmsSummary
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
-from pisigma.validation.held_out.frame_summary import CoordinateFigures, FrameSummary
+from pisigma.validation.held_out.frame_calibration_summary import CoordinateFigures, FrameCalibrationSummary
 
 _REMEDIES = {
     "arm": "calibrate the arm with 40 images or more (`pisigma calibrate` without --only), or state a calibrated model",
@@ -29,7 +29,7 @@ MAX_DIRECTIONS = 3
 CAUSE_TITLE = "possible causes of the residuals, each alone compared with noise alone"
 
 
-def coordinate_table(summary: FrameSummary) -> Table:
+def coordinate_table(summary: FrameCalibrationSummary) -> Table:
     """Return a table of the coordinates in mm and deg, rounded according to their standard errors."""
     return Table(COLUMNS, tuple(map(_coordinate_row, summary.coordinates)))
 
@@ -47,7 +47,7 @@ def _coordinate_row(one: CoordinateFigures) -> tuple[str, ...]:
     )
 
 
-def cause_table(summary: FrameSummary) -> Table:
+def cause_table(summary: FrameCalibrationSummary) -> Table:
     """Return a table of the possible causes of the residuals."""
     columns = ("cause", "log Bayes factor", "explains alone [%]", "most probable size", "named")
     rows = (
@@ -63,7 +63,7 @@ def cause_table(summary: FrameSummary) -> Table:
     return Table(columns, tuple(rows))
 
 
-def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
+def cause_sentence(summary: FrameCalibrationSummary) -> tuple[str, ...]:
     """Return what causes the residuals and what to do; "" if the residuals are only noise."""
     named = [one for one in summary.causes if one.is_supported]
     if not named:
@@ -82,14 +82,14 @@ def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
     )
 
 
-def coordinate_title(summary: FrameSummary) -> str:
+def coordinate_title(summary: FrameCalibrationSummary) -> str:
     """Return the names of the frames to which the coordinates belong."""
     bases = "base of the robot in the measuring frame"
     tools = "tool in the flange of the robot"
     return {"tool": tools, "base": bases, "hand-eye": f"{bases}, and {tools}"}[summary.only]
 
 
-def fit_lines(summary: FrameSummary) -> list[str]:
+def fit_lines(summary: FrameCalibrationSummary) -> list[str]:
     """Return sentences on the residuals, and on directions that the rows hardly determine."""
     sizes = [
         f"{rounded_text(value, summary.rows)} {unit}"
@@ -100,7 +100,7 @@ def fit_lines(summary: FrameSummary) -> list[str]:
     return lines + [f"{one[0].upper()}{one[1:]}." for one in summary.weak_directions[:MAX_DIRECTIONS]]
 
 
-def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> ResultText:
+def frame_text(summary: FrameCalibrationSummary, folder: Path | None, seconds: float) -> ResultText:
     """Lay out calibrated frames.
 
     Args:
@@ -123,7 +123,7 @@ def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> Re
     )
 
 
-def _verdict(summary: FrameSummary, folder: Path | None, warnings: int) -> Verdict:
+def _verdict(summary: FrameCalibrationSummary, folder: Path | None, warnings: int) -> Verdict:
     worst = {
         unit: max((one.standard_error or 0.0 for one in summary.coordinates if one.unit == unit), default=0.0)
         for unit in ("mm", "deg")

@@ -18,7 +18,7 @@ from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
 from pisigma.validation.checks.row_order import instrument_moved_error
 from pisigma.validation.checks.setup_fault import check_joint_columns, check_position_size, setup_diagnostics
-from pisigma.validation.checks.unexplained import check_residual
+from pisigma.validation.checks.unexplained import check_residual_size
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
@@ -142,7 +142,7 @@ def check_rows_of_frames(
             yield check_rows(some, reference).diagnostics
         model = fitted.model if isinstance(reference, Robot) else reference
         yield check_rows_by_model(some, model, kinds[fitted.fit.frame_choice]).diagnostics
-        yield check_residual(checked)
+        yield check_residual_size(checked)
 
     return _until_implausible(findings())
 

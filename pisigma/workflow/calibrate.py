@@ -18,7 +18,7 @@ from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import plugin_features
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements, with_new_frames
-from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
+from pisigma.measurement.exceeded_limits import row_warnings, with_limits_of_rows
 from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
 from pisigma.measurement.splits import Splitting, draw_rows
 from pisigma.model.calibrated_model import CalibratedModel

@@ -17,7 +17,7 @@ from pisigma.lifetime.comparison.parameter_differences import (
 )
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings

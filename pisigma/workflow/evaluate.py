@@ -11,7 +11,7 @@ import torch
 from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, load_model, model_or_folder
@@ -35,7 +35,7 @@ them."""
 
 
 @dataclass(frozen=True)
-class EvaluatedModel:
+class ModelDescription:
     """Description of an evaluated model, without its figures.
 
     Attributes:
@@ -58,7 +58,7 @@ class Evaluation:
         rows: number of evaluated rows.
         settings: settings of the evaluation.
         comparison: figures of every model, with confidence intervals and differences from the first model.
-        evaluated_models: the models, without the references, by their names in the comparison.
+        model_descriptions: descriptions of the models, without the references, by their names in the comparison.
         missed_limits: limits that are missed, as clauses without a full stop.
         diagnostics: reasons why errors of a model are too large for a calibrated robot; empty if they are plausible.
         warnings: sentences with other remarks.
@@ -69,7 +69,7 @@ class Evaluation:
     rows: int
     settings: EvaluationSettings
     comparison: ModelComparison
-    evaluated_models: Mapping[str, EvaluatedModel]
+    model_descriptions: Mapping[str, ModelDescription]
     missed_limits: tuple[str, ...]
     diagnostics: tuple[Diagnostic, ...]
     warnings: tuple[str, ...]
@@ -90,7 +90,7 @@ class Evaluation:
         comparison = self.comparison.to_json()
         comparison["models"] = [
             model.to_json()
-            | (asdict(self.evaluated_models[model.name]) if model.name in self.evaluated_models else {})
+            | (asdict(self.model_descriptions[model.name]) if model.name in self.model_descriptions else {})
             for model in self.models
         ]
         values: dict[str, object] = {
@@ -107,9 +107,9 @@ class Evaluation:
 
     def _single(self) -> dict[str, object]:
         """Repeat the figures of a single model and of the nominal robot at top level, where programs expect them."""
-        if len(self.models) != 2 or len(self.evaluated_models) != 1 or self.models[0].name != "nominal":
+        if len(self.models) != 2 or len(self.model_descriptions) != 1 or self.models[0].name != "nominal":
             return {}
-        model, what = self.models[1], self.evaluated_models[self.models[1].name]
+        model, what = self.models[1], self.model_descriptions[self.models[1].name]
         nominal, corrected = (one.statistics_in_file_units for one in self.models)
         return {
             "model": what.model,
@@ -154,7 +154,7 @@ def evaluate(
     rows = right.rows
     comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted_kinds, distances)
     evaluated = {
-        label: EvaluatedModel(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
+        label: ModelDescription(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
         for label, model in loaded.items()
     }
     judged = [figures for figures in comparison.models if figures.name in evaluated]
@@ -163,7 +163,7 @@ def evaluate(
         rows=rows.rows,
         settings=settings,
         comparison=comparison,
-        evaluated_models=evaluated,
+        model_descriptions=evaluated,
         missed_limits=tuple(
             sentence for figures in judged for sentence in settings.limits.missed_by(figures)
         ),

@@ -43,7 +43,7 @@ from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior

@@ -30,7 +30,7 @@ from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.lifetime.recalibration.summary import HeldOutFigures, RecalibrationSummary
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.geometric_model import model_of_hybrid

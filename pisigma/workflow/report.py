@@ -15,7 +15,7 @@ from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import limit_warnings
+from pisigma.measurement.exceeded_limits import limit_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content

@@ -13,7 +13,7 @@ from pisigma.lifetime.recalibration.motion import find_motion, motion_sentence, 
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model

@@ -59,7 +59,7 @@ def test_wrong_target_names_are_found(shared_data, tmp_path):
     assert clean.status == 0
     assert "target" not in clean.text
     (one_name,) = find_nominal_robot_faults(robot, replace(rows, target=()))
-    assert (one_name.kinds, one_name.amounts) == (("target",), (3.0,))
+    assert (one_name.kinds, one_name.cause_amounts) == (("target",), (3.0,))
     turned = {"A": "B", "B": "C", "C": "A"}
     wrong = tuple(turned[name] if row % 17 == 0 else name for row, name in enumerate(rows.target))
     (mixed,) = find_nominal_robot_faults(robot, replace(rows, target=wrong))

@@ -10,7 +10,7 @@ import torch
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import CopiedRow, without_copies
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.robot.description import Robot
 
 ROBOT = Robot.load("rb5")

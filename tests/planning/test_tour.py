@@ -37,7 +37,7 @@ def test_few_poses_are_in_the_best_order():
 
     def seconds(order: tuple[int, ...]) -> float:
         path = q[list(order)]
-        return float(PACE.duration(arm.robot, path[:-1], path[1:]).sum()) + PACE.settling * len(order)
+        return float(PACE.motion_duration(arm.robot, path[:-1], path[1:]).sum()) + PACE.settling * len(order)
 
     best = min(seconds(order) for order in itertools.permutations(range(len(q))))
     assert sorted(way.order.tolist()) == list(range(len(q)))

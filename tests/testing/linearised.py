@@ -101,7 +101,7 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
     view = sensor_view_of(here)
     values, design = sensor_values(problem, here.point), Design(problem, ())
     weights = [torch.ones_like(sensor.weight_root) for sensor in values]
-    x, group = (here.point - problem.nominal)[problem.active], held_out_groups(solved.setup.measurements)
+    x, group = (here.point - problem.prior_mean)[problem.active], held_out_groups(solved.setup.measurements)
     rows = Rows.from_linearisation(design, x, values, weights, group)
     return LinearisedArm(solved.setup, rows, tuple(view.noise.tolist()), tuple(view.prior_scale.tolist()))
 

@@ -92,7 +92,9 @@ def write_video(path: Path, count: int) -> None:
         moving = at + (actual[number + 1] - at) * steps if number + 1 < count else at[None][:0]
         poses = forward_kinematics(true, torch.cat([at[None], moving])).numpy()
         for frame, T in enumerate(poses):
-            image = render_image(PHONE, TrueBoard(BOARD), T, Exposure(blur=1.0, focus=0.5), random)
+            image = render_image(
+                PHONE, TrueBoard(BOARD), T, Exposure(blur_in_focus=1.0, focus_distance=0.5), random
+            )
             for _ in range(1 if frame else REST):
                 video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
         shown = ",".join(f"{value:.3f}" for value in torch.rad2deg(q[number]).tolist())

@@ -69,7 +69,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
     """Write a model folder with errors of "held-out" rows: those of the calibration, enlarged by a tenth."""
     with no_type_checker():
         found = evaluated_on(arm, arm.measurements)
-        for errors in found.models.values():
+        for errors in found.errors_by_model.values():
             errors.position.mul_(1.1)
         held_out = HeldOutRows.from_validation(found, arm.measurements)
         text = held_out.to_csv(model.robot)

@@ -50,4 +50,4 @@ def test_rows_of_a_model_are_those_of_the_file(arm):
     """The weights that a calibration computes must not make its rows look like others."""
     model, rows, _, _ = arm
     assert model.provenance.data_sha256 == rows.content_hash()
-    assert pisigma.evaluate(model, rows).evaluated_models["so101"].trained_on
+    assert pisigma.evaluate(model, rows).model_descriptions["so101"].trained_on

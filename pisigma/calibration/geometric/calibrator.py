@@ -18,9 +18,9 @@ from pisigma.calibration.geometric.identifiability.redundancy import (
     find_redundancy,
 )
 from pisigma.calibration.geometric.identifiability.sufficiency import (
+    candidates_with_fixed_scale,
     count_estimated_unknowns,
     floating_bases,
-    information_at_start,
     refuse_too_few,
     without_sensor_unknowns,
 )
@@ -252,7 +252,7 @@ class GeometricCalibrator:
         problem, unknowns = setup.problem, setup.free_unknowns
         candidates, explicit = self.candidates(problem.space), not isinstance(self.free, str)
         every = information(problem, setup.start, unknowns + candidates)
-        candidates, at_start = information_at_start(setup, candidates, every)
+        candidates, at_start = candidates_with_fixed_scale(setup, candidates, every)
         nominal_values = setup.start.cpu().numpy()[candidates]
         redundancy = find_redundancy(at_start, nominal_values)
         refuse_too_few(problem, redundancy, explicit, len(unknowns), source)

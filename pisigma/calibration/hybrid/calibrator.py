@@ -205,7 +205,7 @@ class HybridCalibrator:
             for distance, one in zip(distances, values, strict=True)
         ]
         rows = Rows.from_linearisation(
-            design, (point - problem.nominal)[problem.active], values, weights, group
+            design, (point - problem.prior_mean)[problem.active], values, weights, group
         )
         pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.is_stated):

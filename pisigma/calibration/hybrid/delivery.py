@@ -152,7 +152,7 @@ def held_out_row_errors(
 def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValues, ...]:
     """Return all rows linearised at given unknowns."""
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, x[: design.active_count])
     return sensor_values(
         problem, point, chunked_correction(correction_from_weights(design, x)) if design.features else None
     )
@@ -264,7 +264,7 @@ def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Po
     """Return the posterior of the geometric calibration given the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
-    x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
+    x = (solved.solution.linearisation.point - problem.prior_mean)[problem.active]
     rows = linearise_rows(design, x, choice.geometry.posterior.effective_unknowns, group)
     prior = design.prior(view.prior_scale.tolist())
     return build_regression(design, rows).solve(prior, tuple(view.noise.tolist()))

@@ -82,7 +82,7 @@ def _refined(
     rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
 ) -> RefinedFit:
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, posterior.x[: design.active_count])
     return RefinedFit(
         rows, design, posterior, fit, point, correction_from_weights(design, posterior.x), rounds
     )
@@ -126,7 +126,7 @@ def linearise_rows(
         group: see `Rows.group`.
     """
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, x[: design.active_count])
     values = sensor_values(
         problem, point, chunked_correction(correction_from_weights(design, x)) if design.features else None
     )

@@ -197,7 +197,9 @@ def sensor_values(
         motion = moved.motion(point, rows, index)
         for sensor, columns in zip(moved.sensors, collected, strict=True):
             present = sensor.present[rows].nonzero()[:, 0]
-            J = moved.derivative(sensor, motion, unknowns, rows, index)[..., present].permute(2, 1, 0)
+            J = moved.prediction_derivative(sensor, motion, unknowns, rows, index)[..., present].permute(
+                2, 1, 0
+            )
             r = sensor.residual(motion, unknowns, rows)[..., present].t()
             other = sensor.partner_derivative(motion)[len(problem.active) :][..., present].permute(2, 1, 0)
             columns.append((present + rows.start, J, r, other))

@@ -107,16 +107,16 @@ class Server:
         self._stops += 1
         self._notify()
 
-    def reload(self, report: Callable[[str], None]) -> None:
+    def reload(self, report_problem: Callable[[str], None]) -> None:
         """Reload the models while the old models continue to answer.
 
         Args:
-            report: function that is called with a sentence for every model that could not be loaded.
+            report_problem: function that is called with a sentence for every model that could not be loaded.
         """
 
         def load() -> None:
             for problem in self._models.reload():
-                report(problem)
+                report_problem(problem)
 
         self._slow.submit(load)
 

@@ -209,7 +209,7 @@ COMMAND = (
 """Program of the process, without the working directory on the path; `PYTHONSAFEPATH` needs Python 3.11."""
 
 
-class EndedError(Exception):
+class ProcessEndedError(Exception):
     """Error for a process that was ended before it returned a result."""
 
 
@@ -240,7 +240,7 @@ class BackgroundProcess:
                 function, and is raised.
 
         Raises:
-            EndedError: the process was closed in the meantime, died, or was ended by an exception, such as an
+            ProcessEndedError: the process was closed in the meantime, died, or was ended by an exception, such as an
                 interruption, during an earlier call.
         """
         request = pickle.dumps((work, progress is not None))
@@ -294,9 +294,9 @@ class BackgroundProcess:
             raise self._ended() from None
         return answer
 
-    def _ended(self) -> EndedError:
+    def _ended(self) -> ProcessEndedError:
         status = self._process.poll()
-        return EndedError(
+        return ProcessEndedError(
             "the background process ended without returning a "
             f"result{'' if status is None else f' (exit status {status})'}"
         )

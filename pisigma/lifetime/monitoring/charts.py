@@ -208,16 +208,16 @@ class SeriesChange:
 
     Attributes:
         first_index: index of the first value after the change.
-        is_single: whether only this value is changed, rather than also all later values.
+        is_single_value: whether only this value is changed, rather than also all later values.
     """
 
     first_index: int
-    is_single: bool
+    is_single_value: bool
 
     def column(self, count: int) -> Float64[Tensor, " count"]:
         """Return the column of the event: 1 for changed values, 0 for other values."""
         order = torch.arange(count)
-        return (order == self.first_index if self.is_single else order >= self.first_index).double()
+        return (order == self.first_index if self.is_single_value else order >= self.first_index).double()
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,7 +84,7 @@ class Jump:
         sigma: standard deviation of the size [`unit`].
         before: date of the last session before the jump.
         after: date of the first session after the jump.
-        is_single_session: whether only that session deviates.
+        has_reverted: whether the zero returned in the next session, so that only the session `after` deviates.
     """
 
     quantity: str
@@ -93,13 +93,13 @@ class Jump:
     sigma: float
     before: str
     after: str
-    is_single_session: bool = False
+    has_reverted: bool = False
 
     @property
     def sentence(self) -> str:
         """Sentence that states the change."""
         half = NORMAL_95 * self.sigma
-        if self.is_single_session:
+        if self.has_reverted:
             return (
                 f"{self.quantity} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
             )
@@ -114,7 +114,7 @@ class Jump:
             f"deviation_{self.unit}": self.sigma,
             "before": self.before,
             "after": self.after,
-            "is_single_session": self.is_single_session,
+            "has_reverted": self.has_reverted,
         }
 
 
@@ -220,7 +220,7 @@ def jumps_of(joints: Sequence[Row], records: Sequence[Record]) -> tuple[Jump, ..
                     for number in (event.first_index - 1, event.first_index)
                 )
                 what, sizes_of = f"joint {number}", (size * factor, deviation * factor)
-                jumps.append(Jump(what, unit, *sizes_of, before, after, event.is_single))
+                jumps.append(Jump(what, unit, *sizes_of, before, after, event.is_single_value))
     return tuple(jumps)
 
 

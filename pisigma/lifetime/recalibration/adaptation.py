@@ -46,9 +46,9 @@ class AdaptedArm:
 
     @staticmethod
     def from_unknowns(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
-        """Return the arm at the unknowns x of a problem, with parameters relative to `design.problem.nominal`."""
+        """Return the arm at the unknowns x of a problem, with parameters relative to `design.problem.prior_mean`."""
         design = problem.design
-        point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active_count])
+        point = design.problem.prior_mean.index_add(0, design.problem.active, x[: design.active_count])
         return AdaptedArm(
             identified_geometry(problem.setup, point),
             correction_from_weights(design, x) if design.features else None,

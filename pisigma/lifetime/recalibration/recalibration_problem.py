@@ -68,7 +68,7 @@ class RecalibrationProblem:
         posterior: posterior of the model.
         setup: rows, relative to the current bases and tools.
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
-        mean: prior mean of the unknowns, with parameters relative to `design.problem.nominal`.
+        mean: prior mean of the unknowns, with parameters relative to `design.problem.prior_mean`.
         covariance_root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the
             setup.
         coordinate_change: derivative of the parameters in the user's coordinates with respect to the problem's

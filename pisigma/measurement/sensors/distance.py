@@ -99,7 +99,9 @@ class AnchorSensor(AbstractSensor):
         return UnknownGroup("anchor", ANCHOR_COLUMNS, owners, frames) if owners else None
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Guess zero offsets and, by multilateration, the positions that are not stated.
 
         Raises:
@@ -113,7 +115,7 @@ class AnchorSensor(AbstractSensor):
         number = indices_of_names(measurements.anchor, names, measurements.rows)
         for k, name in enumerate(names):
             rows = (number == k).nonzero()[:, 0]
-            points, distance = T[rows, :3, 3], measurements.distance.cpu()[rows]
+            points, distance = T_frame_tool[rows, :3, 3], measurements.distance.cpu()[rows]
             _check_wire(measurements, name, rows, points, reach)
             position = stated_position(measurements, int(rows[0]))
             if position is None:
@@ -300,7 +302,9 @@ class PairSensor(AbstractSensor):
         return -component_along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Check the distances; there are no unknowns to guess.
 
         Raises:
@@ -309,7 +313,7 @@ class PairSensor(AbstractSensor):
         if measurements.pair is None or measurements.distance is None:
             return None
         rows = torch.arange(0, 2 * len(distinct_names(measurements.pair)), 2)
-        apart = (T[rows, :3, 3] - T[rows + 1, :3, 3]).norm(dim=-1)
+        apart = (T_frame_tool[rows, :3, 3] - T_frame_tool[rows + 1, :3, 3]).norm(dim=-1)
         distance = measurements.distance.cpu()[rows]
         error = (distance - apart).abs()
         if len(error) == 0 or float(error.max()) <= MAX_PAIR_ERROR * reach:

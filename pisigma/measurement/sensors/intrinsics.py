@@ -261,7 +261,9 @@ class IntrinsicsSensor(AbstractSensor):
         )
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Return the prior means of the intrinsics; intrinsics without a standard deviation are fixed."""
         names = cameras(measurements)
         if names is None:
@@ -334,7 +336,9 @@ class BoardScaleSensor(AbstractSensor):
         return UnknownGroup("board", ("scale",), owners, frames, units={"scale": "1"}) if owners else None
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Return 0, the stated scale, for every board."""
         if boards(measurements) is None:
             return None

@@ -217,12 +217,14 @@ class AbstractSensor(ABC):
         return None
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Estimate initial unknowns with the nominal robot, and refuse values that are impossible for a similar robot.
 
         Args:
             measurements: the rows; pairs come first, with their rows next to each other.
-            T: poses of the best-fitting tool of the nominal robot, in the frame of every row.
+            T_frame_tool: poses of the best-fitting tool of the nominal robot, in the frame of every row.
             reach: reach of the robot [m].
 
         Raises:

@@ -88,7 +88,9 @@ class SocketSensor(AbstractSensor):
         return UnknownGroup("socket", SOCKET_COLUMNS, owners, frames) if owners else None
 
     @classmethod
-    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+    def initial_guess(
+        cls, measurements: Measurements, T_frame_tool: Poses, reach: float
+    ) -> InitialUnknowns | None:
         """Guess the position of every socket as the mean of its rows.
 
         Raises:
@@ -98,7 +100,7 @@ class SocketSensor(AbstractSensor):
         if not names:
             return None
         socket = indices_of_names(measurements.socket, names, measurements.rows)
-        points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
+        points, socket = T_frame_tool[socket >= 0, :3, 3], socket[socket >= 0]
         middle = group_means(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
         if usual > _MAX_SCATTER * reach:

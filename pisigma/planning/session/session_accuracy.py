@@ -111,7 +111,7 @@ def with_cross_validation(
         return accuracy_so_far.point
     try:
         folds = k_folds(rows, min(_FOLDS, rows.rows), seed=0)
-        errors = validate(HybridCalibrator(robot), rows, folds, progress).models["hybrid"].position
+        errors = validate(HybridCalibrator(robot), rows, folds, progress).errors_by_model["hybrid"].position
     except (IdentificationError, MeasurementError):
         return accuracy_so_far.point
     rms, p95 = _rms_p95(errors)

@@ -47,7 +47,7 @@ def monitoring_page(
     charts: Sequence[Chart],
     sentences: Sequence[str],
     warnings: Sequence[str],
-    refused: Sequence[tuple[str, str, str]] = (),
+    untrusted_sessions: Sequence[tuple[str, str, str]] = (),
     marks: Mapping[str, Sequence[Mark]] = MappingProxyType({}),
     limit_mm: float | None = None,
 ) -> str:
@@ -59,7 +59,7 @@ def monitoring_page(
         charts: control charts of the sessions.
         sentences: sentences on all sessions together.
         warnings: sentences that warn of problems.
-        refused: date and file of every session that must not be trusted, and the reason.
+        untrusted_sessions: date and file of every session that must not be trusted, and the reason.
         marks: days that are marked in the chart of each quantity; days under the key "" are marked in all charts.
         limit_mm: limit on the RMS error [mm]; None if there is none.
     """
@@ -76,7 +76,7 @@ def monitoring_page(
             for chart in charts
         ],
         statistics=[draw_statistics(chart, days, _marks_of(marks, chart)) for chart in charts],
-        sessions=_sessions(records, refused),
+        sessions=_sessions(records, untrusted_sessions),
         charts=with_badges(chart_table(charts), "alarm", {"no": "good"}),
         rate=f"{FALSE_ALARMS_PER_YEAR:g}",
         per_year=SESSIONS_PER_YEAR,

@@ -81,9 +81,9 @@ class Exposure:
         black: gray level of the print, from 0 to 255.
         white: gray level of the paper, from 0 to 255.
         background: gray level around the board, from 0 to 255.
-        blur: standard deviation of the blur in focus [px].
-        focus: distance in focus [m].
-        aperture: diameter of the aperture of the lens [m].
+        blur_in_focus: standard deviation of the blur in focus [px].
+        focus_distance: distance in focus [m].
+        aperture_diameter: diameter of the aperture of the lens [m].
         vignetting: relative loss of light in the corners of the image.
         gradient: change of the light from the left to the right edge of the image, relative to its mean.
         noise: standard deviation of the gray level of a pixel.
@@ -92,9 +92,9 @@ class Exposure:
     black: float = 30.0
     white: float = 200.0
     background: float = 110.0
-    blur: float = 0.7
-    focus: float = 0.5
-    aperture: float = 0.001
+    blur_in_focus: float = 0.7
+    focus_distance: float = 0.5
+    aperture_diameter: float = 0.001
     vignetting: float = 0.2
     gradient: float = 0.2
     noise: float = 2.0
@@ -156,8 +156,8 @@ def _moved(
 
 def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
     """Return the standard deviation of the blur [px] at a depth [m], a quarter of a blurred disc's diameter."""
-    disc = camera.fx * exposure.aperture * np.abs(1 / depth - 1 / exposure.focus)
-    blur: np.ndarray = np.hypot(exposure.blur, disc / 4)
+    disc = camera.fx * exposure.aperture_diameter * np.abs(1 / depth - 1 / exposure.focus_distance)
+    blur: np.ndarray = np.hypot(exposure.blur_in_focus, disc / 4)
     return blur
 
 

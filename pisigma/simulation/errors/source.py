@@ -139,8 +139,8 @@ def _index(robot: Robot, names: list[str], name: str, what: str, place: str) -> 
 
 def stated_joints(
     robot: Robot,
-    for_revolute: Mapping[str, Value],
-    for_prismatic: Mapping[str, Value],
+    revolute_values: Mapping[str, Value],
+    prismatic_values: Mapping[str, Value],
     field_names: tuple[str, str],
     place_in_recipe: str,
     by_axis_name: bool = False,
@@ -149,8 +149,8 @@ def stated_joints(
 
     Args:
         robot: the robot.
-        for_revolute: values of revolute joints, by name.
-        for_prismatic: values of prismatic joints, by name.
+        revolute_values: values of revolute joints, by name.
+        prismatic_values: values of prismatic joints, by name.
         field_names: keys of the two mappings in the recipe, revolute first.
         place_in_recipe: position in the recipe, for messages.
         by_axis_name: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
@@ -160,7 +160,7 @@ def stated_joints(
     """
     values: dict[int, Value] = {}
     joints = robot.axes if by_axis_name else robot.joints
-    kinds = ((for_revolute, *field_names, "revolute"), (for_prismatic, *field_names[::-1], "prismatic"))
+    kinds = ((revolute_values, *field_names, "revolute"), (prismatic_values, *field_names[::-1], "prismatic"))
     for mapping, field, other, kind in kinds:
         for name, value in mapping.items():
             index = _index(robot, [joint.name for joint in joints], name, "joint", place_in_recipe)
@@ -178,13 +178,13 @@ def stated_joints(
 
 def joint_values(
     robot: Robot,
-    for_revolute: Mapping[str, float],
-    for_prismatic: Mapping[str, float],
+    revolute_values: Mapping[str, float],
+    prismatic_values: Mapping[str, float],
     field_names: tuple[str, str],
     place_in_recipe: str,
 ) -> Float64[np.ndarray, " dof"]:
     """Return one value per joint [rad or m], 0 if not stated; see `stated_joints`."""
-    stated = stated_joints(robot, for_revolute, for_prismatic, field_names, place_in_recipe)
+    stated = stated_joints(robot, revolute_values, prismatic_values, field_names, place_in_recipe)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 
 

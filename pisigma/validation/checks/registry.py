@@ -18,7 +18,11 @@ from pisigma.validation.checks.setup_fault import check_setup_fault, check_setup
 from pisigma.validation.checks.stated_noise import check_stated_noise
 from pisigma.validation.checks.temperature import check_temperature
 from pisigma.validation.checks.torques import check_torques
-from pisigma.validation.checks.unexplained import check_residual, check_unexplained, check_unexplained_rows
+from pisigma.validation.checks.unexplained import (
+    check_residual_size,
+    check_unexplained,
+    check_unexplained_rows,
+)
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations, geometric_result
 
@@ -29,7 +33,7 @@ _CHECKS: tuple[Check, ...] = (
     check_row_order,
     check_lag,
     check_rounding,
-    check_residual,
+    check_residual_size,
     check_scale,
     check_prior_ratio,
     check_search,

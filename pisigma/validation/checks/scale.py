@@ -130,13 +130,13 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         sensor_view_of(here).scaled_precision(problem.precision[problem.active], problem.prior_group).numpy()
     )
     parameters = [problem.space.parameters[index] for index in problem.active.tolist()]
-    nominal = problem.nominal[problem.active].numpy()
+    nominal = problem.prior_mean[problem.active].numpy()
     erring = np.array([one.group in ("a", "d") for one in parameters])
     lengths = np.where(erring & (np.abs(nominal) > USUAL_LENGTH), nominal, 0.0)
     if not lengths.any():
         return None
     # At the solution, (N + P) (x - nominal) = b, because the nominal values are the mean of the prior.
-    right = here.normal.numpy() @ (here.point - problem.nominal)[problem.active].numpy()
+    right = here.normal.numpy() @ (here.point - problem.prior_mean)[problem.active].numpy()
     data = here.normal.numpy() - np.diag(precision)
     plain, estimate, information = np.empty((3, len(_LENGTH_ERRORS)))
     for k, error in enumerate(_LENGTH_ERRORS):

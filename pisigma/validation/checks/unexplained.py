@@ -104,7 +104,7 @@ _UNRELATED_SHARE = 0.5
 the variance. For a healthy robot the ratio is below 0.01."""
 
 
-def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+def check_residual_size(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the residuals of every sensor with the robot's reach, and those of positions with the positions' spread.
 
     Half of the measured lengths must be within `plausible_error_per_reach` of the reach per axis, 1 % of most robots,

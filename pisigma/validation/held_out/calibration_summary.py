@@ -149,7 +149,7 @@ class LearnedFigures(StoredFigures):
     variance_factor: Annotated[float, Field(alias="prior_scale")]
 
 
-class HybridFigures(Section):
+class JointCorrectionFigures(Section):
     """Joint correction of a hybrid calibration.
 
     Attributes:
@@ -237,7 +237,7 @@ class CalibrationSummary(AbstractSummary):
     outliers: tuple[OutlierFigures, ...]
     warnings: tuple[str, ...]
     rmse_mm: tuple[float, ...]
-    hybrid: HybridFigures | None = None
+    hybrid: JointCorrectionFigures | None = None
     calibrated: ValidationFigures | None = None
     cross_validation: ValidationFigures | None = None
     test: ValidationFigures | None = None
@@ -328,7 +328,7 @@ def noise_figures(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseF
     return NoiseFigures(sensor=sensor, **{f"sigma_{name}": sigma * factor}, **counts)
 
 
-def _hybrid(result: HybridResult) -> HybridFigures:
+def _hybrid(result: HybridResult) -> JointCorrectionFigures:
     trials = tuple(
         TrialFigures(
             name=trial.name,
@@ -341,7 +341,7 @@ def _hybrid(result: HybridResult) -> HybridFigures:
         for trial in result.trials
     )
     learned = None if result.learned is None else _learned(result, result.learned)
-    return HybridFigures(verdict=result.verdict, learned=learned, trials=trials)
+    return JointCorrectionFigures(verdict=result.verdict, learned=learned, trials=trials)
 
 
 def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:

@@ -48,8 +48,8 @@ class CalibrationValidation:
 
     Attributes:
         folds: number of folds; 1 if rows were held out once, 0 for a separate test set.
-        models: errors by name: "nominal" (the nominal arm with base and tool fitted to the training rows), "geometric",
-            and "hybrid" if requested, which selects its features using only the training rows.
+        errors_by_model: errors under "nominal" (the nominal arm with base and tool fitted to the training rows),
+            "geometric", and "hybrid" if requested, which selects its features using only the training rows.
         spread: position errors with their predicted standard deviations under the hybrid; None without a hybrid.
         distances: errors of held-out stated distances between sockets.
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
@@ -61,7 +61,7 @@ class CalibrationValidation:
     """
 
     folds: int
-    models: Mapping[str, PoseErrors]
+    errors_by_model: Mapping[str, PoseErrors]
     spread: PredictedSpread | None = None
     distances: DistanceErrors = field(default_factory=DistanceErrors)
     frames_fitted: int = 0
@@ -78,8 +78,8 @@ class CalibrationValidation:
     def all_errors(self) -> dict[str, PoseErrors]:
         """Errors of all rows in all repeats by model, one repeat after the other."""
         return {
-            name: PoseErrors.concatenate([repeat.models[name] for repeat in self.repeats])
-            for name in self.models
+            name: PoseErrors.concatenate([repeat.errors_by_model[name] for repeat in self.repeats])
+            for name in self.errors_by_model
         }
 
     @property
@@ -95,14 +95,14 @@ class CalibrationValidation:
             simulations: training and test rows of each of several simulations, whose RMS errors are listed
                 individually.
         """
-        last = list(self.models.values())[-1]
+        last = list(self.errors_by_model.values())[-1]
         figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
         figures["rows"] = int(torch.isfinite(last.position).sum())
         if self.further_repeats:
             figures["repeats"] = len(self.repeats)
             figures["rms_mm_of_repeats"] = {
-                name: tuple(_rms_mm(one.models[name].position) for one in self.repeats)
-                for name in self.models
+                name: tuple(_rms_mm(one.errors_by_model[name].position) for one in self.repeats)
+                for name in self.errors_by_model
             }
         figures |= {name: errors.figures for name, errors in self.all_errors.items()}
         if self.predicted_spread is not None:
@@ -115,7 +115,7 @@ class CalibrationValidation:
         if simulations:
             rms = {
                 name: tuple(_rms_mm(errors.position[test]) for _, test in simulations)
-                for name, errors in self.models.items()
+                for name, errors in self.errors_by_model.items()
             }
             figures["rms_mm_of_simulations"] = rms
             figures["mean_rms_mm"] = {name: sum(values) / len(values) for name, values in rms.items()}
@@ -128,7 +128,7 @@ class JudgedFold:
 
     Attributes:
         test_rows: indices of the held-out rows.
-        errors: their errors by model.
+        errors_by_model: their errors by model.
         distances: errors of stated distances between sockets that its calibration did not use.
         spread: position errors and their predicted standard deviations under the hybrid.
         frames_fitted: number of frames that were held out completely.
@@ -137,7 +137,7 @@ class JudgedFold:
     """
 
     test_rows: Int64[Tensor, " rows"]
-    errors: Mapping[str, PoseErrors]
+    errors_by_model: Mapping[str, PoseErrors]
     distances: DistanceErrors
     spread: PredictedSpread | None
     frames_fitted: int = 0
@@ -149,10 +149,10 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
     """Combine the folds, in the order of the rows."""
     units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
     turned = measurements.rotation is not None or "rad" in units
-    errors = {name: PoseErrors.all_nan(measurements.rows, turned) for name in judged[0].errors}
+    errors = {name: PoseErrors.all_nan(measurements.rows, turned) for name in judged[0].errors_by_model}
     spread = None
     for fold in judged:
-        for name, of_fold in fold.errors.items():
+        for name, of_fold in fold.errors_by_model.items():
             errors[name].set_rows(fold.test_rows, of_fold)
         if fold.spread is not None:
             spread = spread or PredictedSpread.all_nan(measurements.rows)

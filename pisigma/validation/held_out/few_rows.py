@@ -84,7 +84,7 @@ def _helps(
     if ratio < _MIN_RATIO_HELD_OUT:
         return distinct_rows(result.solved.problem) >= _MIN_POSES and _evident(calibrator, result, rows)
     try:
-        errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).models
+        errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).errors_by_model
     except (IdentificationError, MeasurementError):  # with one pose left out, nothing can be fitted
         return False
     nominal, fitted = (errors[name].position.square().nanmean() for name in ("nominal", "geometric"))

@@ -33,7 +33,7 @@ class HeldOutRows:
         q: commanded joint values [rad or m].
         frame: frame of every row.
         target: target of every row.
-        models: lengths [m] and angles [rad] of the errors by model; NaN in rows that were never held out.
+        errors_by_model: lengths [m] and angles [rad] of the errors by model; NaN in rows that were never held out.
         residual: measured minus predicted position under the last model [m], in the row's frame; NaN in rows that were
             never held out, and if it is not stored.
         data_sha256: hash of the measurements.
@@ -44,7 +44,7 @@ class HeldOutRows:
     q: Float64[Tensor, "rows dof"]
     frame: tuple[str, ...]
     target: tuple[str, ...]
-    models: Mapping[str, PoseErrors]
+    errors_by_model: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
     data_sha256: str
     line: tuple[int, ...] = ()
@@ -64,7 +64,7 @@ class HeldOutRows:
             measurements.q,
             measurements.frame,
             measurements.target,
-            validation.models,
+            validation.errors_by_model,
             residual.double(),
             measurements.content_hash(),
             measurements.line,
@@ -88,7 +88,7 @@ class HeldOutRows:
         columns |= {"frame": list(self.frame), "target": list(self.target)}
         columns |= {"file": list(self.origin)} if self.origin else {}
         columns |= {"line": list(map(str, self.line))} if any(self.line) else {}
-        for name, errors in self.models.items():
+        for name, errors in self.errors_by_model.items():
             columns[f"{name}_mm"] = _cells(errors.position * 1e3)
             if errors.rotation is not None:
                 columns[f"{name}_deg"] = _cells(errors.rotation * _DEGREES)

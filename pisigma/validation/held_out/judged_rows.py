@@ -39,7 +39,7 @@ class JudgedRows:
             model; "other": errors of other rows.
         measurements: the rows; only joint values and names for held-out rows that a model stores.
         position: position of the tool in the robot's base frame [m].
-        models: errors of every row by model, "nominal" first and the model last.
+        errors_by_model: errors of every row by model, "nominal" first and the model last.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
         residual_origin: origin of the residuals, in the form of `row_origin`.
         predicted_sigma: standard deviation of the predicted position [m]; NaN if there is none.
@@ -55,7 +55,7 @@ class JudgedRows:
     row_origin: str
     measurements: Measurements
     position: Float64[Tensor, "rows 3"]
-    models: Mapping[str, PoseErrors]
+    errors_by_model: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
     residual_origin: str
     predicted_sigma: Float64[Tensor, " rows"]
@@ -69,12 +69,12 @@ class JudgedRows:
     @property
     def nominal_errors(self) -> PoseErrors:
         """Errors of the nominal robot."""
-        return self.models["nominal"]
+        return self.errors_by_model["nominal"]
 
     @property
     def model_errors(self) -> PoseErrors:
         """Errors of the model."""
-        return list(self.models.values())[-1]
+        return list(self.errors_by_model.values())[-1]
 
     @property
     def scatter(self) -> float | None:
@@ -113,7 +113,7 @@ def rows_of_file(
         residual, origin = held_out.residual, "held_out"
         if not bool(torch.isfinite(residual).any()):
             residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
-        judged = _judged(model, rows, held_out.models, residual, ("held_out", origin))
+        judged = _judged(model, rows, held_out.errors_by_model, residual, ("held_out", origin))
         return replace(judged, left_out=left_out, repeats=_repeats(model))
     known, again = known_rows(model, rows), tuple[str, ...]()
     origin = "training" if digest == model.provenance.data_sha256 or bool(known.all()) else "other"
@@ -154,7 +154,7 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
         origin=held_out.origin,
     )
     origins = ("held_out", "held_out")
-    judged = _judged(model, rows, held_out.models, held_out.residual, origins)
+    judged = _judged(model, rows, held_out.errors_by_model, held_out.residual, origins)
     return replace(judged, repeats=_repeats(model))
 
 
@@ -196,7 +196,7 @@ def _judged(
             rows, source=rows.file_names, origin=tuple(Path(name).name for name in rows.origin)
         ),
         position=tool_positions(model, rows.q),
-        models=models,
+        errors_by_model=models,
         residual=residual,
         residual_origin=origins[1],
         predicted_sigma=predicted_position_sigma(model, rows),

@@ -103,7 +103,7 @@ def figures_of(errors: PoseErrors) -> ErrorFigures:
 
 
 def _of_rows(rows: JudgedRows) -> Accuracy:
-    models = {name: figures_of(errors) for name, errors in rows.models.items()}
+    models = {name: figures_of(errors) for name, errors in rows.errors_by_model.items()}
     origin: RowOrigin = "training" if rows.row_origin == "training" else "file"
     return Accuracy(origin, rows.measurements.rows, models, rows.measurements.source)
 

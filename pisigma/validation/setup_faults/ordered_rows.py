@@ -137,7 +137,7 @@ class OrderedRows:
             if errors is not None:
                 residual = (R.mT @ errors[sensor.name][rows[some], :, None])[..., 0].t()
             root = sensor.present / (sigma if sensor.sigma is None else sigma * sensor.sigma)
-            J = problem.derivative(sensor, motion, unknowns, whole, every)
+            J = problem.prediction_derivative(sensor, motion, unknowns, whole, every)
             residuals.append(torch.where(sensor.present, residual * root, 0.0).t().cpu().numpy())
             derivatives.append((J * root).permute(2, 1, 0).cpu().numpy())
             values += int(sensor.present.sum()) * sensor.components

@@ -27,7 +27,7 @@ class SetupFault:
         rotation_rms_after: root mean square of the rotation errors after correction of the fault [rad].
         largest_zero_shift: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         joints: indices of the joints concerned, from 0.
-        amounts: amount of every cause, see `Cause.amount`.
+        cause_amounts: amount of every cause, see `Cause.amount`.
         signed_column_of_joint: columns with the values of every joint, see `Cause.signed_column_of_joint`.
     """
 
@@ -41,7 +41,7 @@ class SetupFault:
     rotation_rms_after: float
     largest_zero_shift: float = math.inf
     joints: tuple[int, ...] = ()
-    amounts: tuple[float, ...] = ()
+    cause_amounts: tuple[float, ...] = ()
     signed_column_of_joint: tuple[int, ...] = ()
 
     @property
@@ -84,8 +84,12 @@ class SetupFault:
         """Numbers in the sentence, by name, with joints counted from 1; see `Diagnostic.values`."""
         figures = {"before_mm": self.rms_before * 1e3, "after_mm": self.rms_after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
-        if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
-            finite["ratio"] = self.amounts[0]
+        if (
+            len(self.cause_amounts) == 1
+            and self.kinds[0].endswith("_unit")
+            and np.isfinite(self.cause_amounts[0])
+        ):
+            finite["ratio"] = self.cause_amounts[0]
         columns = {"columns": self.signed_column_of_joint} if self.signed_column_of_joint else {}
         return {**finite, "joints": tuple(joint + 1 for joint in self.joints), **columns}
 
@@ -115,7 +119,7 @@ def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
         clause=clause,
         advice=advised,
         largest_zero_shift=moved,
-        amounts=(),
+        cause_amounts=(),
         signed_column_of_joint=(),
     )
 
@@ -144,7 +148,7 @@ def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, nominal_rms_
         rotation_rms_after=after_rotation,
         largest_zero_shift=max(cause.largest_zero_shift for cause in other.causes),
         joints=tuple(joint for cause in other.causes for joint in cause.joints),
-        amounts=tuple(cause.amount for cause in other.causes),
+        cause_amounts=tuple(cause.amount for cause in other.causes),
         signed_column_of_joint=next(
             (cause.signed_column_of_joint for cause in other.causes if cause.signed_column_of_joint), ()
         ),

@@ -16,7 +16,7 @@ from pisigma.lifetime.cell.layout import cells_in
 from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary, summarise_prior
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
+from pisigma.measurement.exceeded_limits import row_warnings, with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.derived_cards import write_fleet_prior_card
 from pisigma.robot.description import Robot

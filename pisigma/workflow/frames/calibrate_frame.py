@@ -14,7 +14,7 @@ from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, loaded_model
 from pisigma.model.frame_model import frames_of_model, frames_of_robot
@@ -23,7 +23,10 @@ from pisigma.robot.description import Robot
 from pisigma.validation.checks.row_order import explain_refusal
 from pisigma.validation.gate import check_rows_of_frames
 from pisigma.validation.held_out.distillation_summary import ParentFigures
-from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
+from pisigma.validation.held_out.frame_calibration_summary import (
+    FrameCalibrationSummary,
+    frame_calibration_summary,
+)
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.model_choice import model_entry
 from pisigma.workflow.cell.new_files import save_under_new_name
@@ -45,7 +48,7 @@ class FrameCalibration(AbstractModelResult):
 
     model: CalibratedModel
     fit: FrameFit
-    summary: FrameSummary
+    summary: FrameCalibrationSummary
     seconds: float
 
     @property
@@ -58,7 +61,7 @@ class FrameCalibration(AbstractModelResult):
         """Return None and the RMS of the position errors of the rows [mm]; see `AbstractModelResult`."""
         return None, self.summary.rms_mm
 
-    def _describe(self, model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
+    def _describe(self, model: CalibratedModel, summary: FrameCalibrationSummary, folder: Path) -> None:
         write_frame_card(model, summary, folder)
 
 
@@ -103,7 +106,7 @@ def calibrate_frame(
         raise explain_refusal(refusal, arm, rows) from refusal
     diagnostics = check_rows_of_frames(rows, arm if model is None else model, found)
     warnings = (one.sentence for one in diagnostics if one.severity == "warning")
-    summary = frame_summary(
+    summary = frame_calibration_summary(
         found.fit, found.arm_variance, found.causes, parent, (*row_warnings(arm, rows), *warnings)
     )
     summary = summary.with_figures(

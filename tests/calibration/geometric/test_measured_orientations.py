@@ -92,7 +92,7 @@ def test_the_factor_makes_lengths_move_by_as_much_as_expected() -> None:
     problem, here = result.solved.problem, result.solved.solution.linearisation
     view = sensor_view_of(here)
     held = view.scaled_precision(problem.precision[problem.active], problem.prior_group)
-    off = (here.point - problem.nominal)[problem.active]
+    off = (here.point - problem.prior_mean)[problem.active]
     factor = angle_disagreement(problem.sensors, view, held, -held * off)[1]
     usual = torch.diag(problem.step_scale)
     (Q, R), (lengths, angles) = (

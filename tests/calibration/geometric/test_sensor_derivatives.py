@@ -50,9 +50,9 @@ def test_derivatives_are_those_of_the_predicted_values() -> None:
 
     motion = problem.motion(point, rows, everything)
     found = {
-        k: problem.derivative(sensor, motion, problem.space.sensor_unknowns(point), rows, everything)[
-            ..., sensor.present
-        ]
+        k: problem.prediction_derivative(
+            sensor, motion, problem.space.sensor_unknowns(point), rows, everything
+        )[..., sensor.present]
         for k, sensor in enumerate(problem.sensors)
         if sensor.name not in ("position", "rotation")
     }

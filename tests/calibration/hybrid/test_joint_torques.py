@@ -22,7 +22,7 @@ from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_torques import JointTorques
 from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model

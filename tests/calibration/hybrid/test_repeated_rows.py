@@ -79,7 +79,7 @@ def test_repeats_whose_joint_values_encoders_read_are_one_row() -> None:
         GeometricCalibrator(robot).build(Measurements(q, forward_kinematics(robot, q)[:, :3, 3])).problem
     )
     assert problem.pose is not None
-    (values,) = sensor_values(problem.with_active(range(30)), problem.nominal)
+    (values,) = sensor_values(problem.with_active(range(30)), problem.prior_mean)
     assert len(values.merge_repeats(problem.pose).row) == 20
 
 
@@ -96,7 +96,7 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
     )
     problem = GeometricCalibrator(robot, base_guesses={"jig": (0.0,) * 6}).build(data).problem
     assert problem.pose is not None
-    (values,) = sensor_values(problem.with_active(range(30)), problem.nominal)
+    (values,) = sensor_values(problem.with_active(range(30)), problem.prior_mean)
     collapsed = values.merge_repeats(problem.pose)
     assert len(values.row) == 120
     assert len(collapsed.row) == 60

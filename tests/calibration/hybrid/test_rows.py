@@ -72,7 +72,7 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
     robot, problem = arm.rows.problem.space.robot, arm.rows.problem
     design = Design(problem, (FourierSeries(robot, 2),))
     x = 1e-4 * torch.randn(design.unknowns, generator=torch.Generator().manual_seed(2)).double()
-    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, x[: design.active_count])
     values = sensor_values(problem, point, correction_from_weights(design, x))
     weights = [torch.ones_like(sensor.weight_root) for sensor in values]
     bare = replace(problem, pose=None)

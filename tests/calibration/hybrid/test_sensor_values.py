@@ -136,7 +136,7 @@ def test_joint_derivatives_are_those_of_the_forward_kinematics(name: str) -> Non
     q = random_joints(robot, 30, 5)
     data = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3].contiguous())
     problem = GeometricCalibrator(robot, base="fixed", tool="fixed").build(data).problem
-    (values,) = sensor_values(problem.with_active([0]), problem.nominal)
+    (values,) = sensor_values(problem.with_active([0]), problem.prior_mean)
     for j in range(robot.dof):
         (numeric,) = differences(
             lambda moved: [-forward_kinematics(robot, moved)[:, :3, 3]], q, 1e-3, (slice(None), j)
@@ -189,7 +189,7 @@ def test_given_standard_deviations_are_the_rows_roots() -> None:
     robot, data = tracker("kiro3", (1, 1, 1, 1))
     sigma = torch.linspace(1e-5, 4e-5, data.rows, dtype=torch.float64)
     problem = GeometricCalibrator(robot).build(replace(data, sigma_position=sigma)).problem
-    values = sensor_values(problem.with_active([0, 1]), problem.nominal)
+    values = sensor_values(problem.with_active([0, 1]), problem.prior_mean)
     found = {sensor.name: sensor for sensor in values}
     assert_close(found["position"].weight_root, 1 / sigma[problem_rows(problem, data)], rtol=1e-12)
     assert (found["position"].has_stated_noise, found["rotation"].has_stated_noise) == (True, False)

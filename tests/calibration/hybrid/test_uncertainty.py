@@ -104,7 +104,7 @@ def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, FeatureFit, Jo
     robot = arm.rows.problem.space.robot
     fitted = arm.fitted((GravityTorques(robot), FourierSeries(robot, 1)), 5)
     problem = arm.rows.problem
-    point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active_count])
+    point = problem.prior_mean.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active_count])
     known = identified_geometry(arm.setup, point)
     found = position_uncertainty(
         arm.rows, fitted.design, NormalEquations.from_rows(fitted.design, arm.rows), fitted.posterior, known

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from pisigma.files.engines.processes import BackgroundProcess, EndedError, compute_here
+from pisigma.files.engines.processes import BackgroundProcess, ProcessEndedError, compute_here
 from pisigma.files.progress import _within_stage
 
 REPORTS = partial(_within_stage, prefix="fold ", what="1 of 2")
@@ -115,7 +115,7 @@ def test_an_interrupted_call_ends_the_process(monkeypatch):
         patch.setattr(process, "_receive", interrupted)
         with pytest.raises(KeyboardInterrupt):
             process.compute(partial(math.hypot, 3, 4))
-    with pytest.raises(EndedError):
+    with pytest.raises(ProcessEndedError):
         process.compute(partial(math.hypot, 6, 8))
     process.close()
 
@@ -128,7 +128,7 @@ def test_the_process_ends_at_once():
     process, ended = BackgroundProcess(), []
 
     def wait():
-        with pytest.raises(EndedError):
+        with pytest.raises(ProcessEndedError):
             process.compute(partial(time.sleep, 60))
         ended.append(time.monotonic())
 
@@ -139,5 +139,5 @@ def test_the_process_ends_at_once():
     process.close()
     waiting.join()
     assert ended[0] - begun < 1
-    with pytest.raises(EndedError):
+    with pytest.raises(ProcessEndedError):
         process.compute(partial(math.hypot, 3, 4))

@@ -92,7 +92,7 @@ def test_jumps_and_outliers_are_distinguished_from_a_drift(off, changes, per_mon
     for month, size in off.items():
         made[month].zeros.shift[0] += math.radians(size)
     found = jumps_of(JOINTS, made)
-    assert [(one.quantity, one.after, one.is_single_session) for one in found] == [
+    assert [(one.quantity, one.after, one.has_reverted) for one in found] == [
         ("joint 1", *one[:2]) for one in changes
     ]
     for one, (_, _, size) in zip(found, changes, strict=True):

@@ -35,7 +35,7 @@ def test_derivatives_are_those_of_the_weighted_errors() -> None:
 
     motion = problem.motion(setup.start, rows, everything)
     J = [
-        problem.derivative(sensor, motion, unknowns(setup.start), rows, everything)
+        problem.prediction_derivative(sensor, motion, unknowns(setup.start), rows, everything)
         for sensor in problem.sensors
     ]
     off = residuals(setup.start)[0].norm(dim=0)

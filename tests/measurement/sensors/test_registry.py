@@ -137,13 +137,13 @@ class HeightGauge(AbstractSensor):
 
     @classmethod
     def initial_guess(
-        cls, measurements: pisigma.Measurements, T: Tensor, reach: float
+        cls, measurements: pisigma.Measurements, T_frame_tool: Tensor, reach: float
     ) -> InitialUnknowns | None:
         names = distinct_names(gauges(measurements))
         if not names:
             return None
         number = indices_of_names(gauges(measurements), names, measurements.rows)
-        off = T[:, 2, 3] - measurements.readings["height"]
+        off = T_frame_tool[:, 2, 3] - measurements.readings["height"]
         zeros = torch.stack([off[number == k].median() for k in range(len(names))])[:, None]
         return InitialUnknowns(zeros, torch.ones_like(zeros, dtype=torch.bool))
 
@@ -245,7 +245,7 @@ def test_their_derivatives_are_those_of_the_predicted_values() -> None:
 
     motion, own = problem.motion(setup.start, rows, everything), problem.space.sensor_unknowns(setup.start)
     for k, sensor in enumerate(problem.sensors):
-        J = problem.derivative(sensor, motion, own, rows, everything)
+        J = problem.prediction_derivative(sensor, motion, own, rows, everything)
         for i in everything.tolist():
             step = torch.zeros_like(setup.start)
             step[i] = 1e-6

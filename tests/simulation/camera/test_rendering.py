@@ -15,7 +15,7 @@ from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_imag
 CAMERA = Camera("small", 640, 400, 500.0, 500.0, 319.5, 199.5, -0.1, 0.05, 1e-4, -2e-4, 0.01)
 BOARD = Board("board", 4, 5, 0.03)
 FLAT = TrueBoard(BOARD)
-SHARP = Exposure(blur=1e-3, aperture=0.0, vignetting=0.0, gradient=0.0, noise=0.0)
+SHARP = Exposure(blur_in_focus=1e-3, aperture_diameter=0.0, vignetting=0.0, gradient=0.0, noise=0.0)
 
 
 def pose(distance: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -55,7 +55,7 @@ def test_light_falls_off_and_noise_is_added():
 
 
 def test_blur_grows_away_from_the_distance_in_focus():
-    exposure = replace(SHARP, focus=0.4, aperture=0.02)
+    exposure = replace(SHARP, focus_distance=0.4, aperture_diameter=0.02)
     slopes = [np.abs(np.diff(rendered(exposure, pose(distance)), axis=1)).max() for distance in (0.4, 0.3)]
     assert slopes[0] > 150 > 80 > slopes[1]
 
@@ -68,7 +68,7 @@ def test_corners_are_detected_where_the_camera_projects_them(bow: float):
     from pisigma.measurement.camera.detection.detector import detect_checkerboard
 
     board, T = TrueBoard(BOARD, 1.01, bow), pose(0.3, (0.2, -0.3, 0.4))
-    image = rendered(Exposure(focus=0.3), T, board)
+    image = rendered(Exposure(focus_distance=0.3), T, board)
     detected = detect_checkerboard(image.astype(np.uint8), BOARD)
     assert isinstance(detected, DetectedBoard)
     projected = CAMERA.project(board.corners @ T[:3, :3].T + T[:3, 3])[0]
@@ -87,7 +87,7 @@ def test_rows_of_a_rolling_shutter_show_the_board_at_their_own_time():
 
     camera, T = Camera("straight", 640, 400, 500.0, 500.0, 319.5, 199.5), pose(0.3)
     shift = np.array([3e-3, 0, 0, 0, 0, 0])
-    image = render_image(camera, FLAT, T, Exposure(focus=0.3), np.random.default_rng(0), shift)
+    image = render_image(camera, FLAT, T, Exposure(focus_distance=0.3), np.random.default_rng(0), shift)
     detected = detect_checkerboard(image, BOARD)
     assert isinstance(detected, DetectedBoard)
     still = camera.project(BOARD.corners @ T[:3, :3].T + T[:3, 3])[0]

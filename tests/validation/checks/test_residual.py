@@ -10,7 +10,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rotation_from_vector
-from pisigma.validation.checks.unexplained import check_residual
+from pisigma.validation.checks.unexplained import check_residual_size
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,8 +36,8 @@ def test_orientations_are_evaluated_like_positions(generator):
     T = forward_kinematics(robot, q)
     wrong = rotation_from_vector(0.05 * torch.randn(40, 3, generator=generator, dtype=torch.float64))
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
-    assert not list(check_residual(checked(GeometricCalibrator(robot), rows)))
+    assert not list(check_residual_size(checked(GeometricCalibrator(robot), rows)))
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=wrong @ T[:, :3, :3])
-    (diagnostic,) = check_residual(checked(GeometricCalibrator(robot), rows))
+    (diagnostic,) = check_residual_size(checked(GeometricCalibrator(robot), rows))
     assert diagnostic.cause == "rotation"
     assert 0.01 < diagnostic.values["residual_rad"] < 0.1

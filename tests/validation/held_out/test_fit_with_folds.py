@@ -19,5 +19,5 @@ def test_processes_give_the_same_to_the_bit() -> None:
     )
     assert torch.equal(here.errors_of(rows)["position"], there.errors_of(rows)["position"])
     validation = joined_repeats(rows, repeats, judged_there)
-    for name, errors in joined_repeats(rows, repeats, judged).models.items():
-        assert torch.equal(errors.position, validation.models[name].position), name
+    for name, errors in joined_repeats(rows, repeats, judged).errors_by_model.items():
+        assert torch.equal(errors.position, validation.errors_by_model[name].position), name

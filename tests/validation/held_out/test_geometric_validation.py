@@ -42,7 +42,9 @@ def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     data = socket_data()
     found = validate(exact(socket_distances=KNOWN), data, k_folds(data, None, 0, "placement"))
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 6, 0)
-    assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
+    assert_close(
+        found.errors_by_model["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8
+    )
     assert_close(found.distances.errors["geometric"], torch.zeros(3, dtype=torch.float64), atol=1e-8)
     figures = found.figures()
     distance = figures.socket_distance
@@ -62,7 +64,7 @@ def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
     arm = simulate("ur5", rows=80, noise=5e-5)
     rows = replace(arm.measurements, target=("A",) * 79 + ("B",))
     found = validate(GeometricCalibrator(arm.nominal), rows, k_folds(rows, 4, seed=0))
-    assert int(torch.isnan(found.models["geometric"].position).sum()) == 1
+    assert int(torch.isnan(found.errors_by_model["geometric"].position).sum()) == 1
     figures = found.figures()
     assert (figures.rows, figures.rows_not_judged) == (79, 1)
     (line,) = held_out_lines(figures)
@@ -84,10 +86,10 @@ def test_an_error_of_a_held_out_socket_is_the_distance_to_where_its_rows_meet() 
     rows = torch.tensor([name.startswith("low/") for name in data.socket or ()])
     part = (~rows).nonzero()[:, 0], rows.nonzero()[:, 0]
     found = validate(exact(socket_distances=KNOWN), data, [part])
-    assert bool(torch.isnan(found.models["nominal"].position[~rows]).all())
+    assert bool(torch.isnan(found.errors_by_model["nominal"].position[~rows]).all())
     arm = replace(exact(socket_distances={k: v for k, v in KNOWN.items() if "low" not in k[0]}), free=())
     errors = arm.fit(data.select(part[0])).errors_of(data.select(part[1]))["socket"]
-    assert_close(found.models["nominal"].position[rows], errors.norm(dim=-1), atol=1e-12)
+    assert_close(found.errors_by_model["nominal"].position[rows], errors.norm(dim=-1), atol=1e-12)
     for name in ("low/0", "low/1"):
         own = torch.tensor([other == name for other in data.socket or ()])[rows]
         assert_close(errors[own].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-12)
@@ -143,8 +145,10 @@ def test_frames_of_exact_touches_are_met_where_they_were_held_out() -> None:
     frames = {name: tuple(base + 0.01) for name, base in TRUE_BASES.items()}
     found = validate(exact(base_guesses=frames), data, k_folds(data, None, 0, "placement"))
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 0, 3)
-    assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
-    assert float(found.models["nominal"].position.square().mean().sqrt()) > 5e-4
+    assert_close(
+        found.errors_by_model["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8
+    )
+    assert float(found.errors_by_model["nominal"].position.square().mean().sqrt()) > 5e-4
     assert held_out_lines(found.figures())[0].startswith("3 frames ")
 
 

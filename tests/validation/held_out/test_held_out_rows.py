@@ -69,14 +69,14 @@ def test_rows_come_back(measured, tmp_path, turned, spread):
     assert found.data_sha256 == measured.content_hash()
     assert (found.frame, found.target) == (measured.frame, measured.target)
     assert_close(found.q, measured.q, atol=1e-14, rtol=1e-9)
-    assert list(found.models) == list(validation.models)
-    for name, errors in validation.models.items():
+    assert list(found.errors_by_model) == list(validation.errors_by_model)
+    for name, errors in validation.errors_by_model.items():
         known = torch.isfinite(errors.position)
-        assert torch.equal(torch.isfinite(found.models[name].position), known)
-        assert_close(found.models[name].position[known], errors.position[known], rtol=6e-5)
-        assert (found.models[name].rotation is not None) == turned
+        assert torch.equal(torch.isfinite(found.errors_by_model[name].position), known)
+        assert_close(found.errors_by_model[name].position[known], errors.position[known], rtol=6e-5)
+        assert (found.errors_by_model[name].rotation is not None) == turned
         if turned:
-            assert_close(found.models[name].rotation, errors.rotation, rtol=6e-5)
+            assert_close(found.errors_by_model[name].rotation, errors.rotation, rtol=6e-5)
     if spread:
         assert_close(found.residual, validation.spread.error, rtol=6e-5)
     else:

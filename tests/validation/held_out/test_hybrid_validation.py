@@ -40,10 +40,10 @@ def found(arm):
 
 def test_all_three_models_are_evaluated_on_the_same_rows(found):
     validation, _, steps = found
-    assert list(validation.models) == ["nominal", "geometric", "hybrid"]
+    assert list(validation.errors_by_model) == ["nominal", "geometric", "hybrid"]
     figures = validation.figures()
     assert (figures.folds, figures.rows) == (3, ROWS)
-    for errors in validation.models.values():
+    for errors in validation.errors_by_model.values():
         assert bool(torch.isfinite(errors.position).all())
     nominal, geometric, hybrid = (errors.rms_mm for errors in figures.models.values())
     assert hybrid < 0.6 * geometric < 0.6 * nominal
@@ -54,11 +54,13 @@ def test_all_three_models_are_evaluated_on_the_same_rows(found):
 def test_geometric_figures_are_those_of_the_geometric_calibrator_alone(arm, found):
     validation, parts, _ = found
     alone = validate(GeometricCalibrator(arm.true.nominal), arm.measurements, parts)
-    assert list(alone.models) == ["nominal", "geometric"]
+    assert list(alone.errors_by_model) == ["nominal", "geometric"]
     assert alone.spread is None
     assert alone.figures().coverage is None
-    for name in alone.models:
-        assert_close(alone.models[name].position, validation.models[name].position, atol=1e-15)
+    for name in alone.errors_by_model:
+        assert_close(
+            alone.errors_by_model[name].position, validation.errors_by_model[name].position, atol=1e-15
+        )
 
 
 def test_every_fold_uses_only_its_training_rows(arm, found):
@@ -66,13 +68,13 @@ def test_every_fold_uses_only_its_training_rows(arm, found):
     train, test = parts[1]
     again = small(arm.true.nominal).fit(arm.measurements.select(train))
     errors = again.errors_of(arm.measurements.select(test))["position"].norm(dim=-1)
-    assert_close(validation.models["hybrid"].position[test], errors, atol=1e-12)
+    assert_close(validation.errors_by_model["hybrid"].position[test], errors, atol=1e-12)
 
 
 def test_means_over_the_parts(found):
     validation, parts, _ = found
     figures = validation.figures(parts)
-    for name, errors in validation.models.items():
+    for name, errors in validation.errors_by_model.items():
         own = [float(errors.position[test].square().mean().sqrt()) * 1e3 for _, test in parts]
         assert_close(figures.rms_mm_of_simulations[name], own, rtol=1e-12)
         assert_close(figures.mean_rms_mm[name], sum(own) / 3, rtol=1e-12)
@@ -121,7 +123,9 @@ def test_rows_kept_aside(arm):
     aside = judge(calibrator, result, seen, other)
     whole = validate(calibrator, arm.measurements, [(train, test)])
     for name in ("nominal", "geometric", "hybrid"):
-        assert_close(aside.models[name].position, whole.models[name].position[test], atol=1e-12)
+        assert_close(
+            aside.errors_by_model[name].position, whole.errors_by_model[name].position[test], atol=1e-12
+        )
     assert_close(aside.spread.sigma, whole.spread.sigma[test], atol=1e-12)
 
 
@@ -175,7 +179,11 @@ def test_nothing_to_learn_leaves_the_geometric_figures():
 
     exact = simulate("kiro4", rows=80, noise=5e-5, turn_noise=1e-4)
     found = validate(small(exact.nominal), exact.measurements, k_folds(exact.measurements, 2, 0))
-    assert isinstance(found.models["hybrid"], PoseErrors)
-    assert_close(found.models["hybrid"].position, found.models["geometric"].position, atol=1e-15)
-    assert_close(found.models["hybrid"].rotation, found.models["geometric"].rotation, atol=1e-15)
+    assert isinstance(found.errors_by_model["hybrid"], PoseErrors)
+    assert_close(
+        found.errors_by_model["hybrid"].position, found.errors_by_model["geometric"].position, atol=1e-15
+    )
+    assert_close(
+        found.errors_by_model["hybrid"].rotation, found.errors_by_model["geometric"].rotation, atol=1e-15
+    )
     assert 0.88 <= found.spread.coverage <= 0.99

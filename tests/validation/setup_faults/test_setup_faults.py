@@ -63,12 +63,12 @@ FAULTS = {
     "frame": (
         lambda rows, T: moved(rows, T, FRAME, EYE),
         ("frame",),
-        {"amounts": [0.680]},
+        {"cause_amounts": [0.680]},
     ),
     "tool": (
         lambda rows, T: moved(rows, T, EYE, TOOL),
         ("tool",),
-        {"amounts": [0.0616]},
+        {"cause_amounts": [0.0616]},
     ),
     "frame and tool": (
         lambda rows, T: moved(rows, T, FRAME, TOOL),
@@ -78,12 +78,12 @@ FAULTS = {
     "mm named m": (
         lambda rows, T: replace(rows, position=rows.position * 1e3),
         ("position_unit",),
-        {"amounts": [1e-3]},
+        {"cause_amounts": [1e-3]},
     ),
     "radians named degrees": (
         lambda rows, T: joints(rows, torch.pi / 180),
         ("joint_unit",),
-        {"joints": (0, 1, 2, 3, 4, 5), "amounts": [180 / torch.pi]},
+        {"joints": (0, 1, 2, 3, 4, 5), "cause_amounts": [180 / torch.pi]},
     ),
     "another order": (
         lambda rows, T: joints(rows, order=[2, 0, 1, 3, 4, 5]),
@@ -136,8 +136,8 @@ def assert_fault(fault: SetupFault, kinds: tuple[str, ...], fields: dict[str, An
     assert fault.joints == fields.get("joints", ())
     if "moved" in fields:
         assert_close(fault.largest_zero_shift, fields["moved"], atol=1e-3)
-    if "amounts" in fields:
-        assert_close(fault.amounts, fields["amounts"], rtol=1e-3)
+    if "cause_amounts" in fields:
+        assert_close(fault.cause_amounts, fields["cause_amounts"], rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", sorted(set(FAULTS) - set(IN_POSES)))
@@ -187,7 +187,7 @@ def test_the_nominal_robot_is_recognised(request, fixture):
     model, rows = request.getfixturevalue(fixture)[:2]
     rows = measured(rows.q, nominal_poses_of_rows(model, rows), False)
     (setup_fault,) = find_setup_faults(model, nominal_model(model, False), rows)
-    assert_fault(setup_fault, ("correction",), {"amounts": [1.0]})
+    assert_fault(setup_fault, ("correction",), {"cause_amounts": [1.0]})
     assert "after_nominal_rms_mm" not in setup_fault.to_json()
 
 
@@ -206,7 +206,7 @@ def test_corrected_values_in_the_log_of_uncorrected_moves(geometric):
     assert int(regular.sum()) > ROWS / 2
     T = poses_of_rows(model, rows)
     (setup_fault,) = find_setup_faults(model, model, measured(logged[regular], T[regular], False))
-    assert_fault(setup_fault, ("correction",), {"amounts": [-1.0]})
+    assert_fault(setup_fault, ("correction",), {"cause_amounts": [-1.0]})
 
 
 def pose_steps(model, rows, q, T, T_wanted):

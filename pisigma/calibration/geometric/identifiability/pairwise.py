@@ -46,7 +46,7 @@ class PairwiseRedundancy:
             first one.
         no_effect: parameters that change no measured value.
         kept: all parameters that are not redundant, with one of each set.
-        tolerance: see `_CORRELATION_TOLERANCE`.
+        correlation_tolerance: see `_CORRELATION_TOLERANCE`.
     """
 
     lengths: CorrelationTable
@@ -54,13 +54,13 @@ class PairwiseRedundancy:
     sets: tuple[tuple[str, ...], ...]
     no_effect: tuple[str, ...]
     kept: tuple[str, ...]
-    tolerance: float
+    correlation_tolerance: float
 
 
 def find_pairwise_redundancy(
     information: Information,
     nominal_values: Float64[np.ndarray, " parameters"],
-    tolerance: float = _CORRELATION_TOLERANCE,
+    correlation_tolerance: float = _CORRELATION_TOLERANCE,
 ) -> PairwiseRedundancy:
     """Find pairs of parameters whose columns of the Jacobian have |r| = 1 (Park et al. 2022, section 3.2).
 
@@ -70,7 +70,7 @@ def find_pairwise_redundancy(
     Args:
         information: the condensed Jacobian.
         nominal_values: nominal values, see `find_redundancy`.
-        tolerance: see `_CORRELATION_TOLERANCE`.
+        correlation_tolerance: see `_CORRELATION_TOLERANCE`.
     """
     columns = information.jacobian
     lengths = np.linalg.norm(columns, axis=0)
@@ -85,7 +85,7 @@ def find_pairwise_redundancy(
             _correlations(information.centred_jacobian[:, chosen], acting[chosen]),
         )
         tables.append(table)
-        for members, signs in _sets(table.values, tolerance):
+        for members, signs in _sets(table.values, correlation_tolerance):
             indices = [chosen[k] for k in members]
             sets.append(
                 tuple(
@@ -100,7 +100,7 @@ def find_pairwise_redundancy(
         sets=tuple(sets),
         no_effect=tuple(parameters[i].name for i in order if not acting[i]),
         kept=tuple(name for i, name in enumerate(information.names) if i not in dropped),
-        tolerance=tolerance,
+        correlation_tolerance=correlation_tolerance,
     )
 
 

@@ -173,7 +173,9 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[Calibrat
         return []
     last = robot.joint_rows[-1]
     names, offs = [], []
-    for name, tool in zip(problem.space.targets, problem.space.split(problem.nominal)[2].cpu(), strict=True):
+    for name, tool in zip(
+        problem.space.targets, problem.space.split(problem.prior_mean)[2].cpu(), strict=True
+    ):
         end = Robot(
             robot.name, robot.maker, robot.source, robot.rows[last:], robot.dh[last:], tool=tool.numpy()
         )
@@ -214,7 +216,7 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     return any(max(values) - min(values) > _SAME_FACE for values in faces.values())
 
 
-def information_at_start(
+def candidates_with_fixed_scale(
     setup: CalibrationSetup, candidates: list[int], information: Information
 ) -> tuple[list[int], Information]:
     """Compute the information on the candidates at the start, with the sensors' unknowns eliminated.

@@ -112,7 +112,7 @@ def information(
         motion = problem.motion(point, rows, index)
         for k, sensor in enumerate(problem.sensors):
             J, r = (
-                problem.derivative(sensor, motion, unknowns, rows, index),
+                problem.prediction_derivative(sensor, motion, unknowns, rows, index),
                 sensor.residual(motion, unknowns, rows),
             )
             weight = torch.full_like(r[0], 1e3) if view is None else _row_weights(problem, view, k, rows)

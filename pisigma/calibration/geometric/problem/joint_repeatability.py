@@ -125,7 +125,9 @@ def _absorbed(
     every = slice(0, problem.rows)
     motion = problem.motion(linearisation.point, every, problem.active)
     unknowns = problem.space.sensor_unknowns(linearisation.point)
-    J = problem.derivative(problem.sensors[number], motion, unknowns, every, problem.active)[..., rows]
+    J = problem.prediction_derivative(problem.sensors[number], motion, unknowns, every, problem.active)[
+        ..., rows
+    ]
     along = torch.einsum("pin,nik->nkp", J, axes)
     variances: Tensor = torch.einsum("nkp,pq,nkq->nk", along, covariance_of(linearisation.normal), along)
     return variances

@@ -126,7 +126,7 @@ def effective_parameters_by_sensor(
     return torch.stack(used) / view.variances
 
 
-def loss_scale(
+def noise_scales(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,

@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.noise import (
     effective_parameters_by_sensor,
     group_variance_ratio,
     joined_contributions,
-    loss_scale,
+    noise_scales,
     rejects_rows,
     renumber,
     sensor_view_of,
@@ -54,7 +54,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         target: index of every row's target.
         sensors: measurements of the rows by sensor.
         loss: loss function.
-        nominal: prior means of all parameters.
+        prior_mean: prior means of all parameters.
         precision: prior precision (1 / variance); 0 for parameters without a prior.
         active: indices of the free parameters.
         pose: index of every row's pose (joint values, frame, target); None if no pose is repeated.
@@ -72,7 +72,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     target: Int64[Tensor, " rows"]
     sensors: tuple[AbstractSensor, ...]
     loss: AbstractLoss
-    nominal: Float64[Tensor, " parameters"]
+    prior_mean: Float64[Tensor, " parameters"]
     precision: Float64[Tensor, " parameters"]
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
@@ -104,7 +104,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active = self.active
         if self.prior_scaling != "estimated":
             return self.space.is_length.to(active.device)[active].long()
-        nonzero = (self.nominal.square() * self.precision > 1)[active].long()
+        nonzero = (self.prior_mean.square() * self.precision > 1)[active].long()
         return self.space.prior_groups.to(active.device)[nonzero, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
@@ -190,7 +190,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         view = sensor_view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
         used = effective_parameters_by_sensor(view, covariance)
-        noise = loss_scale(self.sensors, self.loss, view, used, refine)
+        noise = noise_scales(self.sensors, self.loss, view, used, refine)
         repetition = view.repeat_variance_factor
         if self.pose is not None or self.configuration is not None:
             repetition = group_variance_ratio(
@@ -237,7 +237,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
         """Return the difference of the free parameters from their prior means."""
-        return (point - self.nominal)[self.active]
+        return (point - self.prior_mean)[self.active]
 
     def loss_for_sensor(self, sensor: AbstractSensor) -> AbstractLoss:
         """Return the loss function of a sensor."""
@@ -277,7 +277,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         dh_rows, q, robot = dh.cpu().numpy(), self.q[rows], self.space.robot
         return tool_motion(robot, dh_rows, bases.t(), tools.t(), q, self.needs_rotation, frame, target)
 
-    def derivative(
+    def prediction_derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
     ) -> Tensor:
         """Compute the derivative of a sensor's values with respect to the parameters of the motion."""
@@ -368,7 +368,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             root = root / sensor.sigma[rows]
         if not everywhere:
             root = torch.where(sensor.present[rows], root, 0.0)
-        J = self.derivative(sensor, motion, unknowns, rows, self.active)
+        J = self.prediction_derivative(sensor, motion, unknowns, rows, self.active)
         # With the residual as its last row, one product A A^T gives the normal matrix and the right-hand side.
         A = J.new_empty((J.shape[0] + 1, *J.shape[1:]))
         torch.mul(J, root, out=A[:-1])

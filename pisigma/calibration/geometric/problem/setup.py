@@ -189,7 +189,7 @@ def setup_from_guess(
         target=target,
         sensors=tuple(sensors if distances is None else [*sensors, distances]),
         loss=loss,
-        nominal=start,
+        prior_mean=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
         pose=repeat_indices(repeats, frame, target),

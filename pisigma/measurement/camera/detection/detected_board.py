@@ -185,7 +185,7 @@ class EdgeProfiles:
 def fit_saddles(
     gray: Float64[np.ndarray, "height width"],
     pixels: Float64[np.ndarray, "corners 2"],
-    axes: Float64[np.ndarray, "corners 2 2"],
+    pixels_per_square: Float64[np.ndarray, "corners 2 2"],
     clearance: float,
 ) -> Float64[np.ndarray, "corners 2"]:
     """Fit corners between two black and two white squares by least squares over the surrounding pixels.
@@ -199,17 +199,21 @@ def fit_saddles(
     Args:
         gray: gray values of the image.
         pixels: corners, accurate to half a pixel [px].
-        axes: derivative of pixels with respect to steps along rows and columns of squares, one in each column [px].
+        pixels_per_square: derivative of pixels with respect to steps along rows and columns of squares, one in each
+            column [px].
         clearance: distance from a corner within which no other edge is printed, relative to a square.
 
     Returns:
         The corners; those that a fit would move by more than `_MAX_SHIFT` are not changed.
     """
-    x, weight = _windows(gray.shape, pixels, axes, clearance)
+    x, weight = _windows(gray.shape, pixels, pixels_per_square, clearance)
     values = gray[x[..., 1], x[..., 0]]
     x = x - pixels[:, None]
     state = np.zeros((len(pixels), 9))
-    state[:, 2:4], state[:, 4] = np.arctan2(axes[:, 1], axes[:, 0]), np.log(_INITIAL_BLUR)
+    state[:, 2:4], state[:, 4] = (
+        np.arctan2(pixels_per_square[:, 1], pixels_per_square[:, 0]),
+        np.log(_INITIAL_BLUR),
+    )
     saddle = weight * _saddle(x, state)[0]
     state[:, 5] = (weight * values).sum(1) / np.maximum(weight.sum(1), 1.0)
     state[:, 6] = (saddle * (values - state[:, 5, None])).sum(1) / np.maximum((saddle**2).sum(1), 1.0)

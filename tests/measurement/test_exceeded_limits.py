@@ -10,7 +10,7 @@ from testing.coupled import coupled_robot
 from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import parse_yaml
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import joint_ranges, row_warnings, with_limits_of_rows
+from pisigma.measurement.exceeded_limits import exceeded_limits, row_warnings, with_limits_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.robot.writing import robot_to_yaml
@@ -35,7 +35,7 @@ def test_limits_are_widened_exactly_to_the_rows(robot):
     assert row_warnings(robot, rows_at(robot, q)) == ()
     q[1, 1], q[2, 2] = upper[1] + 0.01, lower[2] - 0.02
     rows = rows_at(robot, q)
-    assert [(one.axis.name, one.rows) for one in joint_ranges(robot, rows)] == [
+    assert [(one.axis.name, one.rows) for one in exceeded_limits(robot, rows)] == [
         (robot.axes[1].name, (1,)),
         (robot.axes[2].name, (2,)),
     ]
@@ -50,7 +50,7 @@ def test_limits_are_widened_exactly_to_the_rows(robot):
     assert change[1, 1] == pytest.approx(0.01)
     assert change[2, 0] == pytest.approx(-0.02)
     assert np.count_nonzero(change) == 2
-    assert joint_ranges(wide, rows) == ()
+    assert exceeded_limits(wide, rows) == ()
     read = Robot(*parse_yaml(robot_to_yaml(wide), RobotDocument, RobotError, "file").to_fields())
     assert np.abs(read.limits - wide.limits).max() < 1e-12
 
@@ -60,4 +60,4 @@ def test_axes_without_limits_have_no_rows_beyond():
     free = dataclasses.replace(
         robot, rows=tuple(dataclasses.replace(row, lower=-np.inf, upper=np.inf) for row in robot.rows)
     )
-    assert joint_ranges(free, rows_at(robot, np.full((2, 6), 100.0))) == ()
+    assert exceeded_limits(free, rows_at(robot, np.full((2, 6), 100.0))) == ()

@@ -21,7 +21,7 @@ UR5 (150 Nm), 60 for the FANUC R-2000iC."""
 
 
 @dataclass(frozen=True, eq=False)
-class JointRange:
+class ExceededLimits:
     """Values of one axis, some of which are beyond its limits.
 
     Attributes:
@@ -64,19 +64,19 @@ class JointRange:
         )
 
 
-def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
-    """Return the ranges of those axes of a robot whose limits are exceeded by rows."""
+def exceeded_limits(robot: Robot, rows: Measurements) -> tuple[ExceededLimits, ...]:
+    """Return the axes of a robot whose limits are exceeded by rows, with the values of all rows."""
     values = robot.to_controller(rows.q.detach().cpu().double().numpy())
     found = []
     for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
         if outside := tuple(np.flatnonzero(beyond_limits(q, axis)).tolist()):
-            found.append(JointRange(axis, q, outside))
+            found.append(ExceededLimits(axis, q, outside))
     return tuple(found)
 
 
 def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
     """Return a warning for every joint whose limits are exceeded by rows."""
-    return tuple(one.sentence(rows, robot) for one in joint_ranges(robot, rows))
+    return tuple(one.sentence(rows, robot) for one in exceeded_limits(robot, rows))
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
@@ -102,7 +102,7 @@ def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
 
 def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
     """Return the robot with joint limits widened to include all rows, or the robot itself if no row exceeds them."""
-    wider = {one.axis.name: one.widened_axis for one in joint_ranges(robot, rows)}
+    wider = {one.axis.name: one.widened_axis for one in exceeded_limits(robot, rows)}
     if not wider:
         return robot
     if robot.coupling is None:

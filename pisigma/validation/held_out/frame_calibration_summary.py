@@ -55,7 +55,7 @@ class CauseFigures(StoredFigures):
     is_supported: Annotated[bool, Field(alias="named")]
 
 
-class FrameSummary(AbstractSummary):
+class FrameCalibrationSummary(AbstractSummary):
     """All figures of a calibrated base, tool or hand-eye transform.
 
     Attributes:
@@ -151,13 +151,13 @@ def _rms(fit: FrameFit, quantity: Literal["m", "rad"]) -> float | None:
     return math.sqrt(squares / rows) if rows else None
 
 
-def frame_summary(
+def frame_calibration_summary(
     fit: FrameFit,
     arm_variance: tuple[float, ...],
     causes: tuple[Cause, ...],
     parent: ParentFigures | None,
     warnings: tuple[str, ...],
-) -> FrameSummary:
+) -> FrameCalibrationSummary:
     """Collect the figures of a fit.
 
     Args:
@@ -169,7 +169,7 @@ def frame_summary(
     """
     result = fit.solved.result()
     lengths, angles = _rms(fit, "m"), _rms(fit, "rad")
-    summary = FrameSummary(
+    summary = FrameCalibrationSummary(
         only=fit.frame_choice,
         rows=fit.rows.rows,
         coordinates=coordinate_figures(fit, arm_variance),
