@@ -33,11 +33,11 @@ from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
     invert,
-    rotation_from_rpy,
+    rotation_from_zyx,
     skew,
     transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
 )
 from pisigma.simulation.camera.simulated_images import ImageNoise, select_far_apart, simulate_images
 
@@ -58,10 +58,10 @@ def views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
     while len(chosen) < count:
         tilt, direction, roll = rng.uniform((0, 0, 0), (np.deg2rad(40), 2 * np.pi, 2 * np.pi))
         angles = torch.tensor([[direction, tilt, np.pi], [roll, 0, 0]], dtype=torch.float64)
-        around, about_view = rotation_from_rpy(angles)
+        around, about_view = rotation_from_zyx(angles)
         position = torch.from_numpy(BOARD.corners.mean(0)) - rng.uniform(0.3, 0.7) * around[:, 2]
-        T = transform_from_xyzrpy(IN_BASE) @ transform(around @ about_view, position)
-        branches = solver.solve(T @ invert(transform_from_xyzrpy(ON_FLANGE))).q
+        T = transform_from_xyz_zyx(IN_BASE) @ transform(around @ about_view, position)
+        branches = solver.solve(T @ invert(transform_from_xyz_zyx(ON_FLANGE))).q
         reached = branches[torch.isfinite(branches).all(-1)]
         if len(reached):
             chosen.append(reached[rng.integers(len(reached))])
@@ -106,7 +106,7 @@ class Cell:
         """Return a true arm with errors of 1 mm and 0.3 deg, and intrinsics with errors as their calibration states."""
         rng = np.random.default_rng(number)
         errors = rng.standard_normal(self.nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
-        base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
+        base = xyz_zyx_from_transform(invert(transform_from_xyz_zyx(IN_BASE))).numpy()
         true = self.nominal.with_geometry(self.nominal.dh + errors, base=base, tool=ON_FLANGE.numpy())
         images = simulate_images(true, self.q, CAMERA, BOARD, NOISE, torch.Generator().manual_seed(number))
         off = rng.standard_normal(len(INTRINSICS)) * USUAL_DEVIATIONS

@@ -23,7 +23,7 @@ from pisigma.measurement.camera.detection.detected_board import DetectedBoard
 from pisigma.measurement.camera.detection.detector import detect_checkerboard
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot import Robot
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.camera.simulated_images import (
     RandomViews,
@@ -40,7 +40,7 @@ IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)
 def main(draws: int, count: int) -> None:
     """Print root mean squares over all draws."""
     nominal = Robot.load("ur5")
-    base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
+    base = xyz_zyx_from_transform(invert(transform_from_xyz_zyx(IN_BASE))).numpy()
     aimed = nominal.with_geometry(nominal.dh, base=base, tool=ON_FLANGE.numpy())
     q = RandomViews(count=count, seed=0).joints(aimed, LENS, BOARD)
     everywhere = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, nominal.dof)))

@@ -42,7 +42,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.simulation.camera.simulated_images import select_far_apart, simulate_images
 
 FIXED_CAMERA = replace(CAMERA, name="fixed", is_fixed=True)
@@ -70,7 +70,7 @@ class Arm:
 
     def with_frames(self, in_base: Tensor | None, on_flange: np.ndarray) -> Robot:
         """Return the true arm with a base and a tool."""
-        base = None if in_base is None else xyzrpy_from_transform(invert(transform_from_xyzrpy(in_base)))
+        base = None if in_base is None else xyz_zyx_from_transform(invert(transform_from_xyz_zyx(in_base)))
         return self.nominal.with_geometry(
             self.dh, base=None if base is None else base.numpy(), tool=on_flange
         )
@@ -108,14 +108,14 @@ def solved(images: Images, camera=CAMERA, board=BOARD) -> Measurements:
 def fixed_views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
     """Return joint values [rad] at which the fixed camera sees the board on the flange."""
     solver, chosen = closed_form_solver(robot), list[Tensor]()
-    T_base_board = transform_from_xyzrpy(IN_BASE)
+    T_base_board = transform_from_xyz_zyx(IN_BASE)
     assert solver is not None  # a UR5
     for q in views(robot, 3 * count, rng):
         T_board_camera = invert(T_base_board) @ forward_kinematics(
             robot.with_geometry(tool=ON_FLANGE.numpy()), q
         )
-        T = transform_from_xyzrpy(CAMERA_IN_BASE) @ invert(T_board_camera)
-        branches = solver.solve(T @ invert(transform_from_xyzrpy(ON_FLANGE))).q
+        T = transform_from_xyz_zyx(CAMERA_IN_BASE) @ invert(T_board_camera)
+        branches = solver.solve(T @ invert(transform_from_xyz_zyx(ON_FLANGE))).q
         reached = branches[torch.isfinite(branches).all(-1)]
         if len(reached):
             chosen.append(reached[rng.integers(len(reached))])

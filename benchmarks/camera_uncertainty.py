@@ -28,7 +28,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_zyx, transform, transform_from_xyz_zyx
 
 CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 WITHIN_95 = 1.959964
@@ -56,7 +56,7 @@ def in_sockets(nominal: Robot, true: Robot, rng: np.random.Generator) -> Measure
         socket = torch.tensor([0.45, y, 0.1], dtype=torch.float64)
         while names.count(name) < TIMES:
             turn = torch.from_numpy(rng.uniform((-np.pi, -0.6, np.pi - 0.6), (np.pi, 0.6, np.pi + 0.6)))
-            T = transform(rotation_from_rpy(turn), socket) @ invert(transform_from_xyzrpy(BALL))
+            T = transform(rotation_from_zyx(turn), socket) @ invert(transform_from_xyz_zyx(BALL))
             branches = solver.solve(T[None]).q[0]
             reached = branches[torch.isfinite(branches).all(-1)]
             if not len(reached):

@@ -45,8 +45,8 @@ from pisigma.robot.se3 import (
     invert,
     rotation_from_vector,
     transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
 )
 from pisigma.simulation.camera.simulated_images import select_far_apart
 
@@ -70,7 +70,7 @@ def touching_joints(count: int) -> Tensor:
     while len(chosen) < count:
         R = rotation_from_vector(torch.from_numpy(rng.uniform(-0.7, 0.7, 3))) @ down
         T = transform(R, torch.tensor([0.4, 0.1, 0.3], dtype=torch.float64))
-        q = solver.solve(T @ invert(transform_from_xyzrpy(torch.from_numpy(TIP)))).q
+        q = solver.solve(T @ invert(transform_from_xyz_zyx(torch.from_numpy(TIP)))).q
         reached = q[torch.isfinite(q).all(-1)]
         if len(reached):
             chosen.append(reached[0])
@@ -129,7 +129,7 @@ def small_jobs() -> None:
 def true_arm(rng: np.random.Generator, is_wrong: bool) -> Robot:
     """Return an arm with base in the frame of the board and tool at the camera."""
     errors = rng.standard_normal(NOMINAL.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
-    base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
+    base = xyz_zyx_from_transform(invert(transform_from_xyz_zyx(IN_BASE))).numpy()
     return NOMINAL.with_geometry(NOMINAL.dh + errors * is_wrong, base=base, tool=ON_FLANGE.numpy())
 
 
@@ -195,7 +195,8 @@ def opencv_robots(images: Images, camera: Camera) -> dict[str, Robot]:
             transform(torch.from_numpy(world[k]), torch.from_numpy(world[k + 1][:, 0])) for k in (0, 2)
         )
         found[name] = NOMINAL.with_geometry(
-            base=xyzrpy_from_transform(to_base).numpy(), tool=xyzrpy_from_transform(invert(to_flange)).numpy()
+            base=xyz_zyx_from_transform(to_base).numpy(),
+            tool=xyz_zyx_from_transform(invert(to_flange)).numpy(),
         )
     return found
 
@@ -207,7 +208,7 @@ def _with_mean_base(flange: np.ndarray, R: np.ndarray, t: np.ndarray, tool: Tens
     U, _, V = torch.linalg.svd(each[:, :3, :3].mean(0))
     base = transform(U @ V, each[:, :3, 3].mean(0))
     return NOMINAL.with_geometry(
-        base=xyzrpy_from_transform(base).numpy(), tool=xyzrpy_from_transform(tool).numpy()
+        base=xyz_zyx_from_transform(base).numpy(), tool=xyz_zyx_from_transform(tool).numpy()
     )
 
 

@@ -26,7 +26,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 POSTURES = 400
 TEMPLATE = Robot.load("ur5e")
@@ -36,7 +36,7 @@ def robot_of(model: RobotModel, Y: np.ndarray, X: np.ndarray) -> Robot:
     """Return a UR arm by its DH parameters, with base in the frame of the target and tool at the camera."""
     columns = (model.theta_offset, model.d, model.a, model.alpha, np.zeros(model.dof))
     base, tool = (
-        xyzrpy_from_transform(torch.from_numpy(np.asarray(one)).double()).numpy()
+        xyz_zyx_from_transform(torch.from_numpy(np.asarray(one)).double()).numpy()
         for one in (np.linalg.inv(Y), X)
     )
     return TEMPLATE.with_geometry(dh=np.stack(columns, 1), base=base, tool=tool)

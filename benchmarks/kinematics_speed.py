@@ -29,7 +29,7 @@ from pisigma.robot import Robot, catalogue
 from pisigma.robot.kinematics.components import (
     IDENTITY,
     as_transform,
-    compose_xyzrpy,
+    compose_xyz_zyx,
     rotate_x,
     rotate_y,
     rotate_z,
@@ -45,7 +45,7 @@ def build_peer(robot: Robot) -> SerialChain:
     A frame of the peer first rotates about its z axis, so the fixed part of a row belongs to the next frame.
     """
     like = torch.zeros((), dtype=torch.float64)
-    fixed = compose_xyzrpy(IDENTITY, robot.base.tolist())
+    fixed = compose_xyz_zyx(IDENTITY, robot.base.tolist())
     root = Frame("root", Link("root"), Joint("root", dtype=torch.float64))
     parent = root
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
@@ -54,7 +54,7 @@ def build_peer(robot: Robot) -> SerialChain:
             parent.add_child(frame)
             parent, fixed = frame, IDENTITY
         fixed = rotate_y(rotate_x(translate(rotate_z(fixed, theta), a, 0.0, d), alpha), beta)
-    tool = as_transform(compose_xyzrpy(fixed, robot.tool.tolist()), like)
+    tool = as_transform(compose_xyz_zyx(fixed, robot.tool.tolist()), like)
     parent.add_child(_frame("tool", tool, "fixed", 1))
     return SerialChain(Chain(root, dtype=torch.float64), "tool", dtype=torch.float64)
 

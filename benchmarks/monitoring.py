@@ -24,7 +24,7 @@ from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur10": "ur10/series_b.csv", "ur5": "ur5/grid.csv"}
@@ -60,7 +60,7 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
     if not tracker:
         return replace(rows, q=q)
     assert rows.position is not None
-    T = transform_from_xyzrpy(torch.tensor(ELSEWHERE).double())
+    T = transform_from_xyz_zyx(torch.tensor(ELSEWHERE).double())
     rotation = None if rows.rotation is None else T[:3, :3] @ rows.rotation
     return replace(rows, q=q, position=rows.position @ T[:3, :3].T + T[:3, 3], rotation=rotation)
 

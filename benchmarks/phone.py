@@ -41,7 +41,7 @@ from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.camera.simulated_images import project_corners, select_far_apart
 from pisigma.workflow.images.calibrate_camera import calibrate_camera
@@ -103,9 +103,9 @@ class Arm:
         dh[:, 3:] += rng.normal(0, 2.5e-3, (5, 2))
         T_tool_board = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
         T_tool_board[:3, 3] = -T_tool_board[:3, :3] @ torch.tensor(board.corners.mean(0))
-        base = invert(phone_in_base()) @ transform_from_xyzrpy(torch.tensor(nominal.base))
-        tool = transform_from_xyzrpy(torch.tensor(nominal.tool)) @ T_tool_board
-        frames = {"base": xyzrpy_from_transform(base).numpy(), "tool": xyzrpy_from_transform(tool).numpy()}
+        base = invert(phone_in_base()) @ transform_from_xyz_zyx(torch.tensor(nominal.base))
+        tool = transform_from_xyz_zyx(torch.tensor(nominal.tool)) @ T_tool_board
+        frames = {"base": xyz_zyx_from_transform(base).numpy(), "tool": xyz_zyx_from_transform(tool).numpy()}
         true = nominal.with_geometry(dh, **frames)
         many, others = (visible(true, board, rng, wanted) for wanted in (CANDIDATES * count, POSES))
         return Arm(nominal.with_geometry(**frames), true, select_far_apart(many, count), others, rng)

@@ -35,7 +35,7 @@ from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, skew, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, skew, xyz_zyx_from_transform
 from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
@@ -81,7 +81,7 @@ class Bench:
             arm, instrument = ArmInSurroundings.from_robot(Robot.load("ur5"), CELL), instrument_of(settings)
             drawn, views = find_candidates(settings, arm), views_of(settings, arm)
         assert views is not None
-        base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
+        base = xyz_zyx_from_transform(invert(views.T_cell_frame)).numpy()
         robot = arm.robot.with_geometry(base=base)
         posterior = {
             name: RobotPosterior.from_robot(robot, instrument, hybrid=name == "hybrid")

@@ -43,11 +43,11 @@ UNITS = np.array([1e3] * 3 + [180 / np.pi] * 3)
 
 def poses_of(ik: pisigma.CorrectedIK) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return poses `(POSES, 6)` [mm, deg] of training rows, joint values near them, and Python's answers [rad or m]."""
-    from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
+    from pisigma.robot.kernels.array_kinematics import transform_of, xyz_zyx_of
 
     starts = ik.model.starts.double().numpy()
     near = starts[np.random.default_rng(0).integers(len(starts), size=POSES)]
-    poses = np.array([xyzrpy_of(T) for T in ik.forward(near)]) * UNITS
+    poses = np.array([xyz_zyx_of(T) for T in ik.forward(near)]) * UNITS
     solutions = [ik(transform_of(pose / UNITS), near=q).q for pose, q in zip(poses, near, strict=True)]
     return poses, near, np.array(solutions)
 

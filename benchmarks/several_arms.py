@@ -39,8 +39,8 @@ from pisigma.robot.se3 import (
     pose_error,
     rotation_from_vector,
     transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
 )
 
 NOMINAL = Robot.load("ur5")
@@ -51,7 +51,7 @@ ARMS, FEW_IMAGES = ("left", "right"), 8
 
 def board_to_base(number: int) -> torch.Tensor:
     """Return the base of an arm in the frame of the board; the second arm is on its other side."""
-    T = invert(transform_from_xyzrpy(IN_BASE))
+    T = invert(transform_from_xyz_zyx(IN_BASE))
     if number == 0:
         return T
     center = torch.from_numpy(BOARD.corners.mean(0))
@@ -103,7 +103,7 @@ def bound(parts: list[np.ndarray], bases: list[np.ndarray]) -> np.ndarray:
     """Return the bound of the second base relative to the first one: shifts along and rotations about its axes."""
 
     def relative(of: np.ndarray) -> torch.Tensor:
-        first, second = (transform_from_xyzrpy(torch.from_numpy(one)) for one in of.reshape(2, 6))
+        first, second = (transform_from_xyz_zyx(torch.from_numpy(one)) for one in of.reshape(2, 6))
         return invert(first) @ second
 
     at = np.concatenate(bases)
@@ -196,7 +196,7 @@ def find_bumped(
             now = []
             for number, arm in enumerate(ARMS):
                 motion = {arm: bump, "board": invert(bump)}.get(body, torch.eye(4, dtype=torch.float64))
-                base = xyzrpy_from_transform(motion @ board_to_base(number)).numpy()
+                base = xyz_zyx_from_transform(motion @ board_to_base(number)).numpy()
                 there = np.concatenate([values[number][:-12], base, values[number][-6:]])
                 images = measured(free, there, later[number], rng)
                 now.append(frames_of_model(models[number], images, "base"))
@@ -220,7 +220,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rng = np.random.default_rng(0)
     q = [views(NOMINAL, arguments.images, rng) for _ in range(2)]
-    bases = [xyzrpy_from_transform(board_to_base(number)).numpy() for number in range(2)]
+    bases = [xyz_zyx_from_transform(board_to_base(number)).numpy() for number in range(2)]
     free = determined_parameters(q[0], bases[0])
     calibrator = GeometricCalibrator(NOMINAL, free=free, prior=None, loss=SquaredLoss())
     if "bound" in arguments.parts:

@@ -39,7 +39,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.row import DH_COLUMNS
-from pisigma.robot.se3 import invert, pose_error, rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, pose_error, rotation_from_vector, transform, transform_from_xyz_zyx
 
 ARMS, NOISE, SIZE, STEP, ROWS, FEW, TOUCHES = ("left", "right"), 5e-5, 3e-4, 1e-6, 60, 8, 20
 IN_HALL = np.array([0.4, -0.7, 0.1, 0.5, 0.05, -0.1])
@@ -176,7 +176,7 @@ class Torso:
     def bound(self, values: list[np.ndarray]) -> np.ndarray:
         """Return the bound of the base and of the branch."""
         sizes = [len(one) for one in values]
-        T = transform_from_xyzrpy(torch.from_numpy(IN_HALL))
+        T = transform_from_xyz_zyx(torch.from_numpy(IN_HALL))
 
         def of_all(u: np.ndarray) -> np.ndarray:
             own = np.split(u[12:], [sizes[0]])
@@ -201,17 +201,17 @@ def compare_torso(sets: int) -> None:
     """Print errors of the base of a torso and of the branch to its right arm."""
     torso = Torso()
     errors, stated, bounds = [], [], []
-    where = transform_from_xyzrpy(torch.from_numpy(IN_HALL))
+    where = transform_from_xyz_zyx(torch.from_numpy(IN_HALL))
     for seed in range(sets):
         rng = np.random.default_rng(seed)
         values = torso.drawn(rng)
         _, _, found = torso.fitted(torso.true(values, IN_HALL), rng)
         right = found.updated_arms[1]
         base = list(right.base_rows("hall"))
-        J = torch.func.jacrev(lambda one: pose_error(transform_from_xyzrpy(one), where))(right.values[base])
+        J = torch.func.jacrev(lambda one: pose_error(transform_from_xyz_zyx(one), where))(right.values[base])
         names = [right.space.index(name) for name in torso.branch]
         offsets = right.values[names].numpy() - torso.nominal[1].dh[0, :2] - values[1][-2:]
-        errors.append(np.r_[pose_error(transform_from_xyzrpy(right.values[base]), where).numpy(), offsets])
+        errors.append(np.r_[pose_error(transform_from_xyz_zyx(right.values[base]), where).numpy(), offsets])
         stated.append(
             torch.cat([J @ right.covariance_root[base], right.covariance_root[names]]).norm(dim=1).numpy()
         )
@@ -231,7 +231,7 @@ def find_zero(still: int) -> None:
     bump = transform(
         rotation_from_vector(torch.tensor([0, 3e-4, -4e-4]).double()), torch.tensor([4e-4, 0, 3e-4]).double()
     )
-    T_hall = transform_from_xyzrpy(torch.from_numpy(IN_HALL))
+    T_hall = transform_from_xyz_zyx(torch.from_numpy(IN_HALL))
     turn = transform(rotation_from_vector(torch.tensor([0, 0, 5e-4]).double()), torch.zeros(3).double())
     for seed in range(still):
         rng = np.random.default_rng(1000 + seed)
@@ -288,7 +288,7 @@ def compare_touches(sets: int) -> None:
     rng = np.random.default_rng(0)
     q = [postures(nominal, rng) for _ in ARMS]
     free = [free_of(nominal, one, IN_HALL) for one in q]
-    T_second = transform_from_xyzrpy(torch.from_numpy(SECOND))
+    T_second = transform_from_xyz_zyx(torch.from_numpy(SECOND))
     points = rng.uniform([0.4, -0.25, -0.1], [0.7, 0.3, 0.3], (TOUCHES, 3))
     errors, stated, bounds = [], [], []
     for seed in range(sets):
@@ -324,7 +324,7 @@ def compare_touches(sets: int) -> None:
             for k in range(2):
                 own = with_values(nominal, free[k], values[k] + split[k], np.zeros(6))
                 base = stepped(
-                    transform_from_xyzrpy(torch.from_numpy(IN_HALL)), u[6 + 6 * k : 12 + 6 * k]
+                    transform_from_xyz_zyx(torch.from_numpy(IN_HALL)), u[6 + 6 * k : 12 + 6 * k]
                 ).numpy()
                 tool = TOOL + np.pad(u[18 + 3 * k : 21 + 3 * k], (0, 3))
                 parts.append(positions(own.with_geometry(tool=tool), q[k]) @ base[:3, :3].T + base[:3, 3])

@@ -35,7 +35,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.planning.session.state import RowsSoFar
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
 
@@ -122,7 +122,7 @@ def reachable_pose(cell: Cell, rows: Path) -> dict[str, str]:
     assert model is not None
     T = forward_kinematics(model.robot, Measurements.read_csv(rows, cell.robot).q)
     reached = (load(cell.folder)(T).status == Status.REACHED).nonzero()[:, 0].tolist()
-    x, y, z, *angles = xyzrpy_from_transform(T[reached[0]]).tolist()
+    x, y, z, *angles = xyz_zyx_from_transform(T[reached[0]]).tolist()
     values = (1e3 * x, 1e3 * y, 1e3 * z, *map(math.degrees, angles))
     return dict(zip(POSE_COLUMNS, map(repr, values), strict=True))
 

@@ -10,7 +10,7 @@ from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.components import IDENTITY, as_transform, compose_row
 from pisigma.robot.row import Row
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 
 class _Step(NamedTuple):
@@ -50,7 +50,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
 
 
 def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
-    """Add roll, pitch and yaw, each `(batch, 1)`, of rotations `(batch, 9)`; see `robot.se3.rpy_from_rotation`."""
+    """Add roll, pitch and yaw, each `(batch, 1)`, of rotations `(batch, 9)`; see `robot.se3.zyx_from_rotation`."""
     node = graph.add_node
     entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
     square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
@@ -107,5 +107,5 @@ def _still(robot: Robot) -> list[np.ndarray]:
 
 
 def _matrix(frame: np.ndarray) -> np.ndarray:
-    matrix: np.ndarray = transform_from_xyzrpy(torch.from_numpy(frame.copy())).numpy()
+    matrix: np.ndarray = transform_from_xyz_zyx(torch.from_numpy(frame.copy())).numpy()
     return matrix

@@ -14,7 +14,7 @@ from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import rpy_from_rotation
+from pisigma.robot.se3 import zyx_from_rotation
 
 _DEGREE = math.pi / 180
 _LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k for k in range(2, 7))))[::-1]
@@ -82,7 +82,7 @@ class RowValues:
         )
         revolute = torch.tensor([axis.type == "revolute" for axis in robot.axes])
         axes = _steps(q[:, revolute], _ANGLE_STEPS), _steps(q[:, ~revolute], _LENGTH_STEPS)
-        angle = _steps(rpy_from_rotation(rotation), _ANGLE_STEPS, _ROTATION_STEP)
+        angle = _steps(zyx_from_rotation(rotation), _ANGLE_STEPS, _ROTATION_STEP)
         steps = torch.stack([*axes, _steps(length, _LENGTH_STEPS), angle], 1)
         if "corner" in READINGS:
             steps[rows.is_measured("corner").cpu(), 2:] = _IMAGE_STEP

@@ -24,7 +24,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 
 if TYPE_CHECKING:
     import pytorch_kinematics
@@ -248,7 +248,7 @@ def geometric_poses(
 def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
     """Return the pose of the robot's base in the frame of every row; see `poses_of_rows` for the errors raised."""
     bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
-    return transform_from_xyzrpy(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
+    return transform_from_xyz_zyx(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
 
 
 def known_names(
@@ -308,9 +308,9 @@ def _seen(
     before = _of_rows(bases, measurements.frame, "frame", measurements)
     behind = _of_rows(tools, measurements.target, "target", measurements)
     if before is not None:
-        T = before @ invert(transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))) @ T
+        T = before @ invert(transform_from_xyz_zyx(torch.from_numpy(robot.base.copy()))) @ T
     if behind is not None:
-        T = T @ invert(transform_from_xyzrpy(torch.from_numpy(robot.tool.copy()))) @ behind
+        T = T @ invert(transform_from_xyz_zyx(torch.from_numpy(robot.tool.copy()))) @ behind
     return T
 
 
@@ -322,7 +322,7 @@ def _of_rows(
     if len(known) < 2:
         return None
     order = list(known)
-    frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
+    frames = transform_from_xyz_zyx(torch.from_numpy(np.stack([known[name] for name in order])))
     return frames[torch.tensor([order.index(name) for name in names], dtype=torch.int64)]
 
 

@@ -23,7 +23,7 @@ from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance, 
 from pisigma.model.geometric_model import branches_of, model_of_calibration
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 
 _KIND = "frame_calibration"
 
@@ -166,14 +166,14 @@ def _with_first(robot: Robot, frames: Mapping[str, Frames]) -> Robot:
 def _moved_along(kind: str, geometric: Robot, before: Robot, after: Frames) -> dict[str, np.ndarray]:
     """Move the frames of a model's geometric part in the same way as the hybrid's frames."""
     T, was = (
-        transform_from_xyzrpy(torch.tensor(one.base if kind == "bases" else one.tool))
+        transform_from_xyz_zyx(torch.tensor(one.base if kind == "bases" else one.tool))
         for one in (geometric, before)
     )
-    now = {name: transform_from_xyzrpy(torch.tensor(frame)) for name, frame in after.items()}
+    now = {name: transform_from_xyz_zyx(torch.tensor(frame)) for name, frame in after.items()}
     moved = {
         name: one @ invert(was) @ T if kind == "bases" else T @ invert(was) @ one for name, one in now.items()
     }
-    return {name: xyzrpy_from_transform(one).numpy() for name, one in moved.items()}
+    return {name: xyz_zyx_from_transform(one).numpy() for name, one in moved.items()}
 
 
 def _uncertainty(

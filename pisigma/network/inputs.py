@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.files.errors import RecipeError, nearest_choice
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import rpy_from_rotation
+from pisigma.robot.se3 import zyx_from_rotation
 
 POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Names of the coordinates of the pose: x, y, z [m], and angles [rad] of the rotation relative to the reference."""
@@ -76,15 +76,15 @@ class Inputs:
             T: poses T_base_tool [m].
             q: nominal joint values of the poses [rad or m].
         """
-        rpy: tuple[Tensor, ...] = ()
+        zyx: tuple[Tensor, ...] = ()
         if set(self.names) & set(POSE_INPUTS[3:]):
             reference = torch.as_tensor(self.reference_rotation, dtype=T.dtype, device=T.device)
-            rpy = rpy_from_rotation(reference.mT @ T[..., :3, :3]).unbind(-1)
+            zyx = zyx_from_rotation(reference.mT @ T[..., :3, :3]).unbind(-1)
         columns = []
         for name in self.names:
             if name in POSE_INPUTS:
                 index = POSE_INPUTS.index(name)
-                columns.append(T[..., index, 3] if index < 3 else rpy[index - 3])
+                columns.append(T[..., index, 3] if index < 3 else zyx[index - 3])
                 continue
             function, factors = self.combination(name)
             angle = q @ torch.tensor(factors, dtype=q.dtype, device=q.device)

@@ -15,7 +15,7 @@ from pisigma.planning.surroundings.surroundings import ViewSection
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.numeric import solve_numeric
-from pisigma.robot.se3 import invert, rotation_from_rpy, transform
+from pisigma.robot.se3 import invert, rotation_from_zyx, transform
 
 _FULL_POSE_DOF = 6
 """Number of joints of an arm that reaches any pose in its workspace, so that a closed form can be used."""
@@ -124,8 +124,8 @@ class BoardViews:
         direction, turn = 2 * math.pi * draws[:, 3:5].t()
         nothing = torch.zeros_like(turn)
         # Roll is the direction of the tilt and pitch its size; the board is then rotated in its own plane.
-        R = rotation_from_rpy(torch.stack([direction, self.max_incidence_angle * draws[:, 5], nothing], 1))
-        R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
+        R = rotation_from_zyx(torch.stack([direction, self.max_incidence_angle * draws[:, 5], nothing], 1))
+        R = R @ rotation_from_zyx(torch.stack([turn, nothing, nothing], 1))
         return transform(R, middle - R @ self._middle)
 
     def _faults(

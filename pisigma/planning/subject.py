@@ -21,7 +21,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 
 _SAME_FRAME = 1e-6
 """Difference [m or rad] below which the frames of a plan equal the frames with which the model was calibrated."""
@@ -87,7 +87,7 @@ class RobotOrModel:
             and surroundings.view.frame is None
             and self._saw_board
         ):
-            x, y, z, *angles = xyzrpy_from_transform(invert(self._from_cell())).tolist()
+            x, y, z, *angles = xyz_zyx_from_transform(invert(self._from_cell())).tolist()
             lengths = {f"{name}_mm": value * 1e3 for name, value in zip("xyz", (x, y, z), strict=True)}
             names = ("roll_deg", "pitch_deg", "yaw_deg")
             frame = FrameSection(**lengths, **dict(zip(names, map(math.degrees, angles), strict=True)))
@@ -132,7 +132,9 @@ class RobotOrModel:
         camera.
         """
         instrument, nominal_base = instrument_of(settings), torch.tensor(arm.nominal.base)
-        base = xyzrpy_from_transform(invert(views.T_cell_frame) @ transform_from_xyzrpy(nominal_base)).numpy()
+        base = xyz_zyx_from_transform(
+            invert(views.T_cell_frame) @ transform_from_xyz_zyx(nominal_base)
+        ).numpy()
         tool = arm.robot.tool
         if self.model is None:
             robot = arm.robot.with_geometry(base=_regular(base), tool=_regular(tool))
@@ -152,18 +154,18 @@ class RobotOrModel:
         """Return the frame of the nominal base in the frame of the model's poses [m]."""
         assert self.model is not None
         nominal_base, fitted = (
-            transform_from_xyzrpy(torch.tensor(robot.base)) for robot in (self.robot, self.model.identified)
+            transform_from_xyz_zyx(torch.tensor(robot.base)) for robot in (self.robot, self.model.identified)
         )
         return fitted @ invert(nominal_base)
 
 
 def _is_same(one: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, " 6"]) -> bool:
     """Return whether two frames, as x, y, z, roll, pitch, yaw [m, rad], are the same."""
-    T = transform_from_xyzrpy(torch.tensor(np.stack([one, other])))
+    T = transform_from_xyz_zyx(torch.tensor(np.stack([one, other])))
     return float((T[0] - T[1]).abs().max()) < _SAME_FRAME
 
 
-def _regular(xyzrpy: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 6"]:
+def _regular(xyz_zyx: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 6"]:
     """Return a frame with limited pitch, so that its three angles are independent."""
-    pitch = np.clip(xyzrpy[4], -_MAX_PITCH, _MAX_PITCH)
-    return np.concatenate([xyzrpy[:4], [pitch], xyzrpy[5:]])
+    pitch = np.clip(xyz_zyx[4], -_MAX_PITCH, _MAX_PITCH)
+    return np.concatenate([xyz_zyx[:4], [pitch], xyz_zyx[5:]])

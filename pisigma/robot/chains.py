@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_chain import Chain, ChainJoint
-from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyz_zyx_of
 from pisigma.robot.urdf_rows import NEARLY_PARALLEL, rows_of_chain
 
 
@@ -61,7 +61,7 @@ def robot_of_origins(
         frame_of(similar_robot.base) @ frame_of(fields.base),
         frame_of(fields.tool) @ frame_of(similar_robot.tool),
     )
-    return moved.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
+    return moved.with_geometry(base=xyz_zyx_of(base), tool=xyz_zyx_of(tool))
 
 
 def with_one_row_per_joint(robot: Robot) -> Robot:
@@ -134,7 +134,7 @@ def pendant_poses(
         (None, *nominal.axes), (0.0, *values[1:].diagonal()), nominal.to_dh(values), inside, strict=True
     )
     return tuple(
-        PendantPose(axis, float(value), xyzrpy_of(_tool(nominal, joints)), bool(allowed))
+        PendantPose(axis, float(value), xyz_zyx_of(_tool(nominal, joints)), bool(allowed))
         for axis, value, joints, allowed in moved
     )
 

@@ -14,7 +14,7 @@ from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
 from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import MAX_ROWS, BoundedFloat, JointType, Row
-from pisigma.robot.urdf_frames import frame_of, rotation, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import frame_of, rotation, translation, xyz_zyx_of
 
 Limits = Annotated[tuple[BoundedFloat, BoundedFloat], Field(description="lower and upper")]
 
@@ -222,5 +222,5 @@ def from_modified_dh(
     standard[:, 2:4] = np.roll(dh[:, 2:4], -1, axis=0)
     standard[-1, 2:4] = 0.0
     if dh[0, 2:4].any():
-        base = xyzrpy_of(frame_of(base) @ rotation(0, dh[0, 3]) @ translation(dh[0, 2], 0.0, 0.0))
+        base = xyz_zyx_of(frame_of(base) @ rotation(0, dh[0, 3]) @ translation(dh[0, 2], 0.0, 0.0))
     return standard, base

@@ -11,26 +11,26 @@ from torch import Tensor
 from pisigma.files.errors import PoseError
 
 
-def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+def rotation_from_zyx(zyx: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`: roll is about z, pitch about y, yaw about x.
 
     Args:
-        rpy: roll, pitch, yaw [rad].
+        zyx: angles about z, y and x: roll, pitch and yaw [rad].
     """
-    cos, sin = torch.cos(rpy), torch.sin(rpy)
+    cos, sin = torch.cos(zyx), torch.sin(zyx)
     cz, cy, cx = cos.unbind(-1)
     sz, sy, sx = sin.unbind(-1)
     cz_sy, sz_sy = cz * sy, sz * sy
     first = (cz * cy, cz_sy * sx - sz * cx, cz_sy * cx + sz * sx)
     second = (sz * cy, sz_sy * sx + cz * cx, sz_sy * cx - cz * sx)
     entries = torch.stack([*first, *second, -sy, cy * sx, cy * cx], -1)
-    return entries.view(*rpy.shape[:-1], 3, 3)
+    return entries.view(*zyx.shape[:-1], 3, 3)
 
 
-def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+def zyx_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Return roll, pitch, yaw [rad] of a rotation; at pitch = ±90 deg yaw is set to 0.
 
-    Inverse of `rotation_from_rpy` for pitch within ±90 deg.
+    Inverse of `rotation_from_zyx` for pitch within ±90 deg.
     """
     regular = R[..., 0, 0].square() + R[..., 1, 0].square() > 1e-24
     cosine, sine = _where_regular(regular, R[..., 0, 0], R[..., 1, 0])
@@ -156,14 +156,14 @@ def transform(
     return torch.cat([upper, last_row], -2)
 
 
-def transform_from_xyzrpy(xyzrpy: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+def transform_from_xyz_zyx(xyz_zyx: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; x, y, z [m], roll, pitch, yaw [rad]."""
-    return transform(rotation_from_rpy(xyzrpy[..., 3:]), xyzrpy[..., :3])
+    return transform(rotation_from_zyx(xyz_zyx[..., 3:]), xyz_zyx[..., :3])
 
 
-def xyzrpy_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
-    """Return x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyzrpy`."""
-    return torch.cat([T[..., :3, 3], rpy_from_rotation(T[..., :3, :3])], -1)
+def xyz_zyx_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """Return x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyz_zyx`."""
+    return torch.cat([T[..., :3, 3], zyx_from_rotation(T[..., :3, :3])], -1)
 
 
 def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:

@@ -38,14 +38,14 @@ def row_frame(theta: float, d: float, a: float, alpha: float, beta: float) -> Fr
     return T
 
 
-def frame_of(xyzrpy: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
+def frame_of(xyz_zyx: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
     """Return the transform `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` of a base or tool."""
-    x, y, z, roll, pitch, yaw = (float(value) for value in xyzrpy)
+    x, y, z, roll, pitch, yaw = (float(value) for value in xyz_zyx)
     T: Frame = translation(x, y, z) @ rotation(2, roll) @ rotation(1, pitch) @ rotation(0, yaw)
     return T
 
 
-def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
+def xyz_zyx_of(T: Frame) -> Float64[np.ndarray, " 6"]:
     """Return x, y, z [m], roll, pitch, yaw [rad] of a transform, the inverse of `frame_of`; pitch is within ±90 deg.
 
     Near a pitch of ±90 deg only the sum or difference of roll and yaw is determined, so yaw is computed from the

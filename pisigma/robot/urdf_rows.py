@@ -23,7 +23,7 @@ from pisigma.robot.urdf_frames import (
     inverse,
     rotation,
     row_frame,
-    xyzrpy_of,
+    xyz_zyx_of,
     zero_if_rounding,
 )
 
@@ -85,8 +85,8 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
         source=f"{URDF_SOURCE}{Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
         rows=coupled_rows,
         dh=np.array(dh),
-        base=xyzrpy_of(frame),
-        tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
+        base=xyz_zyx_of(frame),
+        tool=xyz_zyx_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
         coupling=coupling,
         urdf=chain.content,
     )

@@ -13,7 +13,7 @@ from pisigma.files.yaml_writing import yaml_text
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units
-from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyz_zyx_of
 
 
 def robot_to_yaml(robot: Robot) -> str:
@@ -217,7 +217,7 @@ def _type(row: Row, robot: str) -> str:
 
 def origin_attributes(T: Frame) -> dict[str, str]:
     """Return `xyz` and `rpy` of a frame with all digits; `rpy` are rotations about the fixed axes x, y, z in order."""
-    x, y, z, roll, pitch, yaw = (repr(float(value) + 0.0) for value in xyzrpy_of(T))
+    x, y, z, roll, pitch, yaw = (repr(float(value) + 0.0) for value in xyz_zyx_of(T))
     return {"xyz": f"{x} {y} {z}", "rpy": f"{yaw} {pitch} {roll}"}
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import Phrase, RecipeError
 from pisigma.files.yaml_file import MAX_POSES, Count, Section, Seed
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_zyx, transform
 from pisigma.simulation.errors.source import stated_joints
 
 Triple = tuple[float, float, float]
@@ -61,11 +61,11 @@ class OrientationSection(Section):
             home = torch.tensor(self.home_rotation, dtype=torch.float64)
         else:
             rpy_deg = torch.tensor(self.home_rpy_deg or (0.0,) * 3, dtype=torch.float64)
-            home = rotation_from_rpy(torch.deg2rad(rpy_deg))
+            home = rotation_from_zyx(torch.deg2rad(rpy_deg))
         if not self.spread_deg:
             return home.expand(count, 3, 3).clone()
         draws = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
-        return home @ rotation_from_rpy(torch.deg2rad(self.spread_deg * draws))
+        return home @ rotation_from_zyx(torch.deg2rad(self.spread_deg * draws))
 
 
 _EXTRA_DRAWS = 9

@@ -17,7 +17,7 @@ from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.robot_file import FrameSection
-from pisigma.robot.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_zyx, transform, transform_from_xyz_zyx
 from pisigma.simulation.commanded import BranchSection
 
 
@@ -50,12 +50,12 @@ class JigPlacement(Section):
     @property
     def T_jig_base(self) -> Float64[Tensor, "4 4"]:
         """Nominal pose of the base in the frame of the jig [m]."""
-        return transform_from_xyzrpy(torch.from_numpy(self.base.to_si()))
+        return transform_from_xyz_zyx(torch.from_numpy(self.base.to_si()))
 
     @property
     def true_T_jig_base(self) -> Float64[Tensor, "4 4"]:
         """True pose of the base in the frame of the jig [m]."""
-        return transform_from_xyzrpy(torch.from_numpy((self.true_base or self.base).to_si()))
+        return transform_from_xyz_zyx(torch.from_numpy((self.true_base or self.base).to_si()))
 
 
 def check_names(placements: Sequence[JigPlacement]) -> None:
@@ -236,8 +236,8 @@ class TouchCandidatesSection(Section):
         tilt = torch.arccos(1 - (1 - torch.cos(tilt)) * u[:, 4])
         azimuth, about_wire = (2 * torch.pi * u[:, 5], 2 * torch.pi * u[:, 6])
         zero = torch.zeros_like(tilt)
-        R = rotation_from_rpy(torch.stack([azimuth, tilt, zero], -1))
-        R = R @ rotation_from_rpy(torch.stack([about_wire, zero, zero + torch.pi], -1))
+        R = rotation_from_zyx(torch.stack([azimuth, tilt, zero], -1))
+        R = R @ rotation_from_zyx(torch.stack([about_wire, zero, zero + torch.pi], -1))
         sampled = TouchCandidates(
             placements=(name,),
             placement=torch.zeros_like(face),

@@ -16,7 +16,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.planning.plan_inputs import sight_of
 from pisigma.planning.session.state import RowsSoFar, SessionState
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody, MeshBody
 from pisigma.workbench.viewing.colors import RAMP, round_up
 from pisigma.workbench.viewing.scene import SessionScene
@@ -171,7 +171,7 @@ class CellScene:
             elif name == "view.frame":
                 T = np.eye(4)
                 T[:3, :3] = Rotation.from_quat(node.wxyz, scalar_first=True).as_matrix()
-                angles = np.rad2deg(xyzrpy_from_transform(torch.from_numpy(T))[3:].numpy())
+                angles = np.rad2deg(xyz_zyx_from_transform(torch.from_numpy(T))[3:].numpy())
                 places |= {f"{key}.{axis}_mm": one for axis, one in zip("xyz", at, strict=True)}
                 for axis, angle in zip(("roll", "pitch", "yaw"), angles, strict=True):
                     places[f"{key}.{axis}_deg"] = f"{180.0 - (180.0 - round(angle, 2)) % 360.0:.2f}"

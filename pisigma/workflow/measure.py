@@ -41,7 +41,7 @@ from pisigma.planning.session.state import (
 )
 from pisigma.planning.subject import RobotOrModel
 from pisigma.planning.task import task_poses
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.workflow.settings.measuring import MeasureSettings
 
 _STEP = 5
@@ -281,7 +281,7 @@ class MeasuringSession:
         following = self._next_pose(int(open_poses[0])) if len(open_poses) else None
         base = None
         if model is not None:
-            base = transform_from_xyzrpy(torch.from_numpy(next(iter(model.geometry.bases.values())))).numpy()
+            base = transform_from_xyz_zyx(torch.from_numpy(next(iter(model.geometry.bases.values())))).numpy()
         return SessionState(
             rows=rows,
             alarms=tuple(sorted(self._alarms, key=lambda alarm: alarm.line)),

@@ -31,7 +31,7 @@ from pisigma.model.folder.model_document import write_document
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import pose_error, transform_from_xyz_zyx
 from pisigma.validation.held_out.arms_summary import ArmsSummary
 from pisigma.workflow.arms.calibrate_arms import (
     FRAMES_FILE,
@@ -91,7 +91,7 @@ def test_every_arm_has_a_model_and_the_file_has_their_bases(calibrated):
     values = [base.x_mm, base.y_mm, base.z_mm, base.roll_deg, base.pitch_deg, base.yaw_deg]
     found = torch.tensor([v / 1e3 for v in values[:3]] + list(np.deg2rad(values[3:])), dtype=torch.float64)
     shown = torch.tensor([1e3] * 3 + [180 / np.pi] * 3)
-    error = pose_error(pose_of(BASES[1]), transform_from_xyzrpy(found)) * shown
+    error = pose_error(pose_of(BASES[1]), transform_from_xyz_zyx(found)) * shown
     covariance = torch.tensor(base.covariance, dtype=torch.float64)
     assert float(error @ torch.linalg.solve(covariance, error)) < 17  # 99 % of chi-squared
     assert_close(

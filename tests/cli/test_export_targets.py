@@ -18,14 +18,14 @@ from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 COLUMNS = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
 FAR = (9000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def poses_of(name: str, q: torch.Tensor) -> list[tuple[float, ...]]:
-    values = xyzrpy_from_transform(forward_kinematics(Robot.load(name), q))
+    values = xyz_zyx_from_transform(forward_kinematics(Robot.load(name), q))
     return [tuple(row) for row in torch.cat([values[:, :3] * 1e3, torch.rad2deg(values[:, 3:])], -1).tolist()]
 
 
@@ -258,7 +258,7 @@ def test_the_command_tells_its_formats(run):
 
 
 def test_a_program_is_rewritten(run, refuses, models, tmp_path):
-    values = xyzrpy_from_transform(
+    values = xyz_zyx_from_transform(
         forward_kinematics(Robot.load("ur10"), joints_around("ur10", 1, seed=6, spread=0.1))
     )
     letters = [f"{letter} {value}" for letter, value in zip("XYZABC", torch.cat(

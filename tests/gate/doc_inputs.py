@@ -27,7 +27,7 @@ from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_file import read_plan
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 Maker = Callable[[Path, Path], None]
 """Creates a file or folder from the folder of small inputs."""
@@ -114,7 +114,7 @@ def poses_near(robot: str, q_deg: tuple[float, ...], count: int = 3) -> Maker:
     """Write poses of a robot near some joint values."""
 
     def made(path: Path, small: Path) -> None:
-        values = xyzrpy_from_transform(_near(robot, q_deg, count))
+        values = xyz_zyx_from_transform(_near(robot, q_deg, count))
         rows = torch.cat([1e3 * values[:, :3], torch.rad2deg(values[:, 3:])], 1).tolist()
         lines = [",".join(map(str, row)) for row in rows]
         path.write_text("\n".join(["x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg", *lines]) + "\n")

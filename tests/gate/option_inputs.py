@@ -28,7 +28,7 @@ from pisigma.measurement.foreign.lerobot_motors import motors_text
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -133,7 +133,7 @@ def _sockets(folder: Path) -> None:
     arm = simulate("ur5", rows=1, length=3e-4, angle=5e-4)
     rng, lines = np.random.default_rng(1), []
     from pisigma.robot.kinematics.numeric import solve_numeric
-    from pisigma.robot.se3 import rotation_from_rpy, transform
+    from pisigma.robot.se3 import rotation_from_zyx, transform
 
     tool = arm.true.with_geometry(arm.true.dh, base=np.zeros(6), tool=np.array([0.06, -0.04, 0.13, 0, 0, 0]))
     for place, corner in (("a", (0.45, 0.1, 0.3)), ("b", (0.1, 0.5, 0.2)), ("c", (-0.4, 0.2, 0.4))):
@@ -141,7 +141,7 @@ def _sockets(folder: Path) -> None:
             ball = torch.tensor([[corner[0] + 0.05 * ball_seat, corner[1], corner[2]]]).double()
             found = 0
             while found < 8:
-                R = rotation_from_rpy(torch.from_numpy(rng.uniform((-3, -0.6, 2.6), (3, 0.6, 3.6), (1, 3))))
+                R = rotation_from_zyx(torch.from_numpy(rng.uniform((-3, -0.6, 2.6), (3, 0.6, 3.6), (1, 3))))
                 start = torch.from_numpy(rng.uniform(-2, 2, (1, 1, 6)))
                 solved = solve_numeric(tool, transform(R, ball), start)
                 q = solved.q.reshape(-1, 6)[0]
@@ -214,7 +214,7 @@ def _models(folder: Path) -> None:
 
 def _write_poses(path: Path, T: torch.Tensor) -> list[list[float]]:
     """Write poses as a table, and return them [mm, deg]."""
-    values = xyzrpy_from_transform(T)
+    values = xyz_zyx_from_transform(T)
     poses = torch.cat([values[:, :3] * 1e3, torch.rad2deg(values[:, 3:])], 1).tolist()
     lines = [",".join(map(str, one)) for one in poses]
     path.write_text("\n".join(["x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg", *lines]) + "\n")

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
+from pisigma.robot.kernels.array_kinematics import transform_of, xyz_zyx_of
 
 REQUEST, ANSWER, HEAD = (
     struct.Struct("<4sIQII16d8d"),
@@ -44,7 +44,7 @@ def good_stream(rng: random.Random, protocol: str, ik: CorrectedIK, messages: in
             near = [*q, *[0.0] * (8 - len(q))] if rng.random() < 0.5 else [math.nan] * 8
             parts.append(REQUEST.pack(b"PSI1", REQUEST.size, name, 0, 0, *T.ravel(), *near))
         else:
-            x, y, z, *angles = xyzrpy_of(T)
+            x, y, z, *angles = xyz_zyx_of(T)
             pose = [1e3 * x, 1e3 * y, 1e3 * z, *map(math.degrees, angles)]
             parts.append(json.dumps({"id": name, "pose": pose}).encode() + b"\n")
     return b"".join(parts)

@@ -25,7 +25,7 @@ from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, 
 from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.robot import Robot, Row
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rpy_from_rotation
+from pisigma.robot.se3 import zyx_from_rotation
 from pisigma.simulation.errors.joint_compliance import LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)
@@ -196,7 +196,7 @@ def test_shared_features_are_the_same_for_every_joint(name):
     assert_close(ScaledJoints(robot).columns(JointState(q))[:, 0], scaled_joints(robot, q))
     assert_close(SinesCosines(robot).columns(JointState(q))[:, 0], unit_inputs(robot, q))
     T = forward_kinematics(robot, q)
-    pose = torch.cat([T[:, :3, 3] / robot.reach, rpy_from_rotation(T[:, :3, :3])], -1)
+    pose = torch.cat([T[:, :3, 3] / robot.reach, zyx_from_rotation(T[:, :3, :3])], -1)
     assert_close(NominalPose(robot).columns(JointState(q))[:, 0], pose, atol=1e-14)
 
 

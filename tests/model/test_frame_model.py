@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, poses_of_rows
 from pisigma.model.frame_model import frames_of_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.gate import check_rows_of_frames
 
 TOOL = np.array([0.03, -0.02, 0.1, 0.0, 0.0, 0.0])
@@ -36,7 +36,7 @@ def new_target(model: CalibratedModel, rows: int = 6) -> Measurements:
     """Return positions in the frame "floor" of a new target that the model predicts exactly."""
     q = joints_in(model.robot, rows, 3)
     flange = Measurements(q=q, frame=("floor",) * rows, target=("A",) * rows)
-    tool = transform_from_xyzrpy(torch.from_numpy(np.stack([model.hybrid_tools["A"], TOOL])))
+    tool = transform_from_xyz_zyx(torch.from_numpy(np.stack([model.hybrid_tools["A"], TOOL])))
     T = poses_of_rows(model, flange) @ torch.linalg.inv(tool[0]) @ tool[1]
     return replace(flange, position=T[:, :3, 3], target=("C",) * rows)
 

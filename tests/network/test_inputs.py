@@ -13,7 +13,7 @@ from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot import Robot, Row
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 Q = torch.tensor([0.3, -1.2, 0.7, 2.0, -0.4, 1.1], dtype=torch.float64)
 POSE = torch.tensor([0.1, -0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64)
@@ -44,21 +44,23 @@ def ur10() -> Robot:
 def test_values_by_hand(ur10):
     inputs = Inputs.from_names(ur10, list(VALUES))
     expected = torch.tensor(list(VALUES.values()), dtype=torch.float64)
-    assert_close(inputs(transform_from_xyzrpy(POSE), Q), expected, atol=1e-15)
+    assert_close(inputs(transform_from_xyz_zyx(POSE), Q), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2), (0,)])
 def test_batch_shapes_and_dtypes(ur10, batch, dtype):
     inputs = Inputs.from_names(ur10, ["x", "yaw", "sin(theta_1 + theta_2)"])
-    values = inputs(transform_from_xyzrpy(POSE).to(dtype).expand(*batch, 4, 4), Q.to(dtype).expand(*batch, 6))
+    values = inputs(
+        transform_from_xyz_zyx(POSE).to(dtype).expand(*batch, 4, 4), Q.to(dtype).expand(*batch, 6)
+    )
     assert values.shape == (*batch, 3)
     assert values.dtype == dtype
 
 
 def test_angles_are_relative_to_the_reference(ur10):
     reference = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
-    T = transform_from_xyzrpy(POSE)
+    T = transform_from_xyz_zyx(POSE)
     T[:3, :3] = torch.from_numpy(reference) @ T[:3, :3]
     values = Inputs.from_names(ur10, ["roll", "pitch", "yaw"], reference)(T, Q)
     assert_close(values, POSE[3:], atol=1e-15)
@@ -122,7 +124,7 @@ def test_only_joints_in_groups_are_corrected(ur10, generator):
         networks.append(PiSigma(len(names), len(joints), (2,)))
         networks[-1].initialise(0.3, generator)
     network = CorrectionNetwork(6, groups, networks)
-    T = transform_from_xyzrpy(POSE).expand(3, 4, 4)
+    T = transform_from_xyz_zyx(POSE).expand(3, 4, 4)
     correction = network(T, Q.expand(3, 6))
     first, second = networks[0](groups[0].inputs(T, Q.expand(3, 6))), networks[1](Q[:1].sin().expand(3, 1))
     assert_close(correction[:, [4, 0]], first, rtol=1e-14)

@@ -16,7 +16,7 @@ from jig_report import FIGURES, run_jigs, seed_figures
 from jig_run import run_jigs_recipe
 from jig_tables import all_tables
 from pisigma.files.errors import RecipeError
-from pisigma.robot.se3 import rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_zyx
 
 PICTURES = ("touches.png", "errors.png", "straight_lines.png", "seeds.png")
 
@@ -85,7 +85,7 @@ def test_errors_in_the_robot_and_jig_frames_differ_by_a_rotation_where_the_base_
     accuracy = measure_accuracy(bench, JigCalibration(nominal_calibration(recipe).arm, bases))
     assert rms(accuracy.points) > 1e-3
     for placement in recipe.placements:
-        R = rotation_from_rpy(torch.from_numpy(placement.true_base.to_si()[3:]))
+        R = rotation_from_zyx(torch.from_numpy(placement.true_base.to_si()[3:]))
         assert_close(accuracy.seen_from[placement.name], accuracy.points @ R.mT, atol=1e-12)
 
 

@@ -10,7 +10,7 @@ from testing.refusals import refused
 from pisigma.files.errors import UnreachablePoseError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_zyx, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from straight_lines import Controller, i_move, move_l
@@ -26,7 +26,7 @@ def true_robot(rows: dict | None = None, tool: dict | None = None) -> TrueRobot:
 
 
 def ends(start: tuple, end: tuple) -> torch.Tensor:
-    R = rotation_from_rpy(torch.deg2rad(torch.tensor([180.0, -145, 0], dtype=torch.float64)))
+    R = rotation_from_zyx(torch.deg2rad(torch.tensor([180.0, -145, 0], dtype=torch.float64)))
     return transform(R.expand(2, 3, 3), torch.tensor([start, end], dtype=torch.float64))
 
 

@@ -12,7 +12,7 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Pri
 from pisigma.files.errors import IdentificationError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyz_zyx
 from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
 from touch_planning import (
     PlanningProblem,
@@ -166,7 +166,7 @@ def test_impossible_plans_are_refused():
 def test_the_robots_own_base_does_not_matter():
     moved = ROBOT.with_geometry(base=np.array([0.1, -0.2, 0.3, 0.4, 0.1, 0.2]))
     found = candidates(10)
-    Ts = torch.stack([transform_from_xyzrpy(torch.from_numpy(p.base.to_si())) for p in PLACEMENTS])
+    Ts = torch.stack([transform_from_xyz_zyx(torch.from_numpy(p.base.to_si())) for p in PLACEMENTS])
     one, other = (build_planning_problem(r, found, Ts, found.q, FREE) for r in (ROBOT, moved))
     assert_close(one.rows, other.rows)
     assert_close(one.weight, other.weight)

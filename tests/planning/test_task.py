@@ -14,7 +14,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.task import TASK_POSES, task_poses
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rpy_from_rotation
+from pisigma.robot.se3 import zyx_from_rotation
 
 
 @pytest.mark.parametrize("kind", ["joints", "poses"])
@@ -30,7 +30,7 @@ def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, kind: str):
             *(",".join(map(str, row)) for row in q.rad2deg().tolist()),
         ]
     else:
-        values = torch.cat([T[:, :3, 3] * 1e3, rpy_from_rotation(T[:, :3, :3]).rad2deg()], 1)
+        values = torch.cat([T[:, :3, 3] * 1e3, zyx_from_rotation(T[:, :3, :3]).rad2deg()], 1)
         rows = [
             "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg",
             *(",".join(map(str, row)) for row in values.tolist()),

@@ -12,10 +12,10 @@ from pisigma.robot.frame_fits import (
     best_tool,
     smallest_error,
 )
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyz_zyx
 
-BASE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
-TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
+BASE = transform_from_xyz_zyx(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
+TOOL = transform_from_xyz_zyx(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
 LEVER = 0.2
 
 

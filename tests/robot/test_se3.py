@@ -28,8 +28,8 @@ vectors = st.tuples(*[st.floats(-3.0, 3.0, allow_nan=False)] * 3)
 def random_transforms(
     generator: torch.Generator, *batch: int, dtype: torch.dtype = torch.float64
 ) -> torch.Tensor:
-    xyzrpy = 2 * torch.rand((*batch, 6), generator=generator, dtype=torch.float64) - 1
-    return se3.transform_from_xyzrpy(xyzrpy.to(dtype))
+    xyz_zyx = 2 * torch.rand((*batch, 6), generator=generator, dtype=torch.float64) - 1
+    return se3.transform_from_xyz_zyx(xyz_zyx.to(dtype))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
@@ -39,25 +39,25 @@ def test_inverse_and_dtype_and_batch(generator, batch, dtype, atol):
     product = T @ se3.invert(T)
     assert product.dtype == dtype
     assert_close(product, torch.eye(4).expand(*batch, 4, 4), atol=atol)
-    assert_close(se3.transform_from_xyzrpy(se3.xyzrpy_from_transform(T)), T, atol=atol)
+    assert_close(se3.transform_from_xyz_zyx(se3.xyz_zyx_from_transform(T)), T, atol=atol)
 
 
 @given(st.tuples(angles, st.floats(-1.57, 1.57), angles))
-def test_rpy_is_z_y_x_and_is_restored(rpy):
-    R = se3.rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64))
-    assert_close(R, Rotation.from_euler("ZYX", rpy).as_matrix(), atol=1e-14)
-    assert_close(se3.rotation_from_rpy(se3.rpy_from_rotation(R)), R, atol=1e-13)
+def test_angles_are_about_z_y_x_and_are_restored(zyx):
+    R = se3.rotation_from_zyx(torch.tensor(zyx, dtype=torch.float64))
+    assert_close(R, Rotation.from_euler("ZYX", zyx).as_matrix(), atol=1e-14)
+    assert_close(se3.rotation_from_zyx(se3.zyx_from_rotation(R)), R, atol=1e-13)
 
 
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
-def test_rpy_at_gimbal_lock_reproduces_rotation_with_finite_gradient(pitch):
-    rpy = torch.tensor([0.4, pitch, -0.3], dtype=torch.float64)
-    R = se3.rotation_from_rpy(rpy)
-    again = se3.rpy_from_rotation(R)
+def test_angles_at_gimbal_lock_reproduce_rotation_with_finite_gradient(pitch):
+    zyx = torch.tensor([0.4, pitch, -0.3], dtype=torch.float64)
+    R = se3.rotation_from_zyx(zyx)
+    again = se3.zyx_from_rotation(R)
     assert again[2] == 0
-    assert_close(se3.rotation_from_rpy(again), R, atol=1e-12)
-    assert torch.isfinite(jacrev(se3.rpy_from_rotation)(R)).all()
-    assert torch.isfinite(jacrev(se3.rpy_from_rotation)(torch.eye(3, dtype=torch.float64))).all()
+    assert_close(se3.rotation_from_zyx(again), R, atol=1e-12)
+    assert torch.isfinite(jacrev(se3.zyx_from_rotation)(R)).all()
+    assert torch.isfinite(jacrev(se3.zyx_from_rotation)(torch.eye(3, dtype=torch.float64))).all()
 
 
 @given(vectors)

@@ -12,7 +12,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import OutputError
 from pisigma.robot import Robot, Row
-from pisigma.robot.urdf_frames import frame_of, inverse, rotation, row_frame, xyzrpy_of
+from pisigma.robot.urdf_frames import frame_of, inverse, rotation, row_frame, xyz_zyx_of
 from pisigma.robot.writing import robot_to_urdf
 
 ROWS = (
@@ -82,12 +82,12 @@ def test_a_calibrated_robot_has_no_far_frames():
 @pytest.mark.parametrize("side", [1, -1])
 def test_rotations_near_the_singular_pitch_are_exact(tilt, side):
     R = rotation(2, 0.3) @ rotation(1, side * math.pi / 2 + tilt) @ rotation(0, 1.1) @ rotation(2, 1e-9)
-    assert_close(frame_of(xyzrpy_of(R)), R, atol=5e-15)
+    assert_close(frame_of(xyz_zyx_of(R)), R, atol=5e-15)
 
 
 def test_frames():
     values = np.array([0.1, -0.2, 0.3, 2.0, -1.0, 3.0])
-    assert_close(xyzrpy_of(frame_of(values)), values, atol=1e-15)
+    assert_close(xyz_zyx_of(frame_of(values)), values, atol=1e-15)
     assert_close(inverse(frame_of(values)) @ frame_of(values), np.eye(4), atol=1e-15)
     assert row_frame(0.0, 0.0, 0.0, math.pi / 2, 0.0)[1, 1] == 0.0
     assert_close(

@@ -7,12 +7,12 @@ import torch
 from pydantic import ValidationError
 from testing.closeness import assert_close
 
-from pisigma.robot.se3 import check_transforms, pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import check_transforms, pose_error, transform_from_xyz_zyx
 from pisigma.simulation.noise import MeasurementNoise
 
 
 def poses(count: int, generator: torch.Generator) -> torch.Tensor:
-    return transform_from_xyzrpy(torch.randn(count, 6, generator=generator, dtype=torch.float64))
+    return transform_from_xyz_zyx(torch.randn(count, 6, generator=generator, dtype=torch.float64))
 
 
 def test_noise_has_its_standard_deviation_on_every_axis(generator):

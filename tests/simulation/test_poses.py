@@ -10,7 +10,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.robot.se3 import check_transforms, rotation_from_rpy
+from pisigma.robot.se3 import check_transforms, rotation_from_zyx
 from pisigma.simulation.poses import (
     CubeGrid,
     CubeRandom,
@@ -36,7 +36,7 @@ def test_polar_grid_has_the_papers_points():
             r, phi = 0.2 + 0.04 * i, math.radians(8.18 * j)
             assert_close(T[index, :3, 3], [r * math.cos(phi), r * math.sin(phi), 0.3], atol=1e-15)
             index += 1
-    turned = rotation_from_rpy(torch.tensor([math.radians(30), 0, 0], dtype=torch.float64))
+    turned = rotation_from_zyx(torch.tensor([math.radians(30), 0, 0], dtype=torch.float64))
     assert_close(T[:, :3, :3], turned.expand(100, 3, 3), atol=1e-16)
 
 
@@ -58,7 +58,7 @@ def test_spread_rotates_the_home_orientation_as_documented():
     draws = torch.rand(125, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     home = torch.tensor(KIRO4_HOME, dtype=torch.float64)
     rpy = (2 * draws - 1) * math.pi / 4
-    assert_close(T[:, :3, :3], home @ rotation_from_rpy(rpy), atol=1e-15)
+    assert_close(T[:, :3, :3], home @ rotation_from_zyx(rpy), atol=1e-15)
     check_transforms(T, "grid", tolerance=1e-14)
 
 

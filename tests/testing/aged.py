@@ -10,7 +10,7 @@ from testing.models import no_type_checker
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 NAME = "rb5"
 
@@ -41,6 +41,6 @@ def rows_after_change(
     """
     true = hybrid_of(NAME).true
     q = joints_in(true.nominal, rows, seed)
-    T = transform_from_xyzrpy(torch.tensor(base).double()) @ true.forward(q + torch.tensor(moved).double())
+    T = transform_from_xyz_zyx(torch.tensor(base).double()) @ true.forward(q + torch.tensor(moved).double())
     drawn = np.random.default_rng(seed).normal(size=(rows, 3))
     return Measurements(q=q, position=T[:, :3, 3] + noise * torch.from_numpy(drawn))

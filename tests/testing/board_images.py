@@ -7,7 +7,7 @@ import torch
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.pattern import board_pattern
-from pisigma.robot.se3 import rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_zyx
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
 
@@ -18,7 +18,7 @@ FINER = 8
 
 def view(board: Board, distance: float, rpy: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return R_camera_board and t [m] with the board's centre on the camera's axis; 0, 0, 0 is a frontal view."""
-    R = rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64)).numpy()
+    R = rotation_from_zyx(torch.tensor(rpy, dtype=torch.float64)).numpy()
     return R, np.array([0.0, 0.0, distance]) - R @ (board.corners.max(0) / 2)
 
 

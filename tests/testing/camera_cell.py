@@ -15,10 +15,10 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.se3 import (
     invert,
-    rotation_from_rpy,
+    rotation_from_zyx,
     transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
 )
 from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 
@@ -59,7 +59,7 @@ def camera_cell(
         first = CAMERA_IN_BASE if is_fixed else BOARD_IN_BASE
         rng = np.random.default_rng(seed)
         errors = rng.standard_normal(nominal.dh.shape) * [angle, length, length, angle, angle]
-        base = xyzrpy_from_transform(invert(_transform(first))).numpy()
+        base = xyz_zyx_from_transform(invert(_transform(first))).numpy()
         true = nominal.with_geometry(nominal.dh + errors, base=base, tool=ON_FLANGE)
         q = _joints_of_views(nominal, count, rng, is_fixed)
         generator = torch.Generator().manual_seed(seed)
@@ -74,7 +74,7 @@ def _joints_of_views(robot: Robot, count: int, rng: np.random.Generator, is_fixe
     while len(chosen) < count:
         tilt, direction, roll = rng.uniform((0, 0, 0), (np.deg2rad(40), 2 * np.pi, 2 * np.pi))
         angles = torch.tensor([[direction, tilt, np.pi], [roll, 0, 0]], dtype=torch.float64)
-        around, about_view = rotation_from_rpy(angles)
+        around, about_view = rotation_from_zyx(angles)
         position = torch.from_numpy(BOARD.corners.mean(0)) - rng.uniform(0.3, 0.7) * around[:, 2]
         view = transform(around @ about_view, position)
         T = _transform(CAMERA_IN_BASE) @ invert(view) if is_fixed else _transform(BOARD_IN_BASE) @ view
@@ -108,5 +108,5 @@ def aligned_error(true: Tensor, estimated: Tensor) -> float:
     return float((A - B @ U @ Vh).norm(dim=1).square().mean().sqrt())
 
 
-def _transform(xyzrpy: np.ndarray) -> Tensor:
-    return transform_from_xyzrpy(torch.from_numpy(xyzrpy))
+def _transform(xyz_zyx: np.ndarray) -> Tensor:
+    return transform_from_xyz_zyx(torch.from_numpy(xyz_zyx))

@@ -17,7 +17,7 @@ from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement import splits
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
@@ -161,8 +161,8 @@ def _measured(
         number = torch.arange(rows) % len(payloads)
         T, names = every[number, torch.arange(rows)], {"payload": torch.tensor(payloads).double()[number]}
     if frames:
-        T_frame = transform_from_xyzrpy(torch.tensor([[0.0] * 6, [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]]).double())
-        T_target = transform_from_xyzrpy(
+        T_frame = transform_from_xyz_zyx(torch.tensor([[0.0] * 6, [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]]).double())
+        T_target = transform_from_xyz_zyx(
             torch.tensor([[0.0] * 6, [0.05, 0.1, -0.04, 0.0, 0.0, 0.0]]).double()
         )
         number = torch.arange(rows)

@@ -20,7 +20,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, rotation_from_vector, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_vector, transform_from_xyz_zyx
 
 FRAMES = torch.tensor(
     [[0.3, -0.2, 0.1, 0.4, -0.2, 0.3], [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]], dtype=torch.float64
@@ -60,8 +60,8 @@ def tracker_data(
     """
     rng = np.random.default_rng(seed)
     number = torch.arange(len(q)) * int(several)
-    T = invert(transform_from_xyzrpy(FRAMES))[number % 2] @ forward_kinematics(true, q + delta)
-    T = T @ transform_from_xyzrpy(TARGETS)[number // 2 % 2]
+    T = invert(transform_from_xyz_zyx(FRAMES))[number % 2] @ forward_kinematics(true, q + delta)
+    T = T @ transform_from_xyz_zyx(TARGETS)[number // 2 % 2]
     position = T[:, :3, 3] + noise * torch.from_numpy(rng.normal(size=(len(q), 3)))
     rotation = None
     if turn_noise is not None:

@@ -13,7 +13,7 @@ from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.camera.simulated_images import (
     ImageNoise,
@@ -45,11 +45,11 @@ def servo_arm(seed: int) -> tuple[Robot, Robot, np.random.Generator]:
 def arm_before_phone(seed: int) -> tuple[Robot, torch.Tensor, np.random.Generator]:
     """Return an arm as built, with the phone as frame and the board as target, and 500 joint values in view [rad]."""
     nominal, true, random = servo_arm(seed)
-    T_base = torch.from_numpy(FROM_PHONE) @ transform_from_xyzrpy(torch.tensor(nominal.base))
+    T_base = torch.from_numpy(FROM_PHONE) @ transform_from_xyz_zyx(torch.tensor(nominal.base))
     facing = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
-    T_tool = transform_from_xyzrpy(torch.tensor(nominal.tool)) @ facing
+    T_tool = transform_from_xyz_zyx(torch.tensor(nominal.tool)) @ facing
     true = true.with_geometry(
-        true.dh, base=xyzrpy_from_transform(T_base).numpy(), tool=xyzrpy_from_transform(T_tool).numpy()
+        true.dh, base=xyz_zyx_from_transform(T_base).numpy(), tool=xyz_zyx_from_transform(T_tool).numpy()
     )
     q = torch.from_numpy(random.uniform(*np.clip(nominal.limits, -1.5, 1.5).T, (20_000, 5)))
     T = forward_kinematics(true, q)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
@@ -68,7 +68,7 @@ class SimulatedTracker:
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the true pose of the target."""
-        return self.true.forward(q) @ transform_from_xyzrpy(TARGET)
+        return self.true.forward(q) @ transform_from_xyz_zyx(TARGET)
 
 
 @functools.cache
@@ -81,7 +81,7 @@ def simulated_tracker(
     generator = torch.Generator().manual_seed(seed)
     low, high = torch.from_numpy(robot.limits).t()
     q = low + (high - low) * torch.rand(rows + 2000, 6, generator=generator, dtype=torch.float64)
-    p = (true.forward(q) @ transform_from_xyzrpy(TARGET))[:, :3, 3]
+    p = (true.forward(q) @ transform_from_xyz_zyx(TARGET))[:, :3, 3]
     off = noise * torch.randn(rows, 3, generator=generator, dtype=torch.float64)
     train = Measurements(q=q[:rows], position=p[:rows] + off)
     return SimulatedTracker(robot, true, train, Measurements(q=q[rows:], position=p[rows:].contiguous()))

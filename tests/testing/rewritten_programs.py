@@ -25,10 +25,10 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 
-FRAME = transform_from_xyzrpy(torch.tensor([0.4, -0.3, 0.1, 0.5, -0.2, 0.1], dtype=torch.float64))
-TOOL = transform_from_xyzrpy(torch.tensor([0.02, -0.01, 0.15, 0.3, 0.1, -0.4], dtype=torch.float64))
+FRAME = transform_from_xyz_zyx(torch.tensor([0.4, -0.3, 0.1, 0.5, -0.2, 0.1], dtype=torch.float64))
+TOOL = transform_from_xyz_zyx(torch.tensor([0.02, -0.01, 0.15, 0.3, 0.1, -0.4], dtype=torch.float64))
 TOLERANCE_MM = 0.02
 
 
@@ -228,7 +228,7 @@ def attained_poses(arm: Path, commanded: torch.Tensor, wanted: torch.Tensor) -> 
     """Return the poses that the real tool reaches with a controller that uses the nominal robot."""
     model = load_model(arm)
     base, tool = (
-        transform_from_xyzrpy(torch.from_numpy(f.copy())) for f in (model.robot.base, model.robot.tool)
+        transform_from_xyz_zyx(torch.from_numpy(f.copy())) for f in (model.robot.base, model.robot.tool)
     )
     before, after = base @ FRAME, invert(TOOL) @ tool
     q = closed_form_solver(model.robot).solve(before @ commanded @ after).q

@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 ARM = ["a_1", "a_2", "a_3", "d_4", "theta_2", "theta_3", "theta_4", "theta_5"]
 TRUE_BASES = {
@@ -54,7 +54,7 @@ def touch_data(
     parts = []
     for number, frame in enumerate(frames):
         q = joints(count, 10 + number)
-        T = transform_from_xyzrpy(torch.from_numpy(TRUE_BASES[frame])) @ forward_kinematics(
+        T = transform_from_xyz_zyx(torch.from_numpy(TRUE_BASES[frame])) @ forward_kinematics(
             true_robot().geometric_robot, q
         )
         axis = torch.arange(count) % len(axes)
@@ -118,7 +118,7 @@ def socket_data() -> Measurements:
 def mixed_data() -> Measurements:
     """Return one data set of all sensors: tracker, touches, sockets, wire and pairs, in four frames."""
     q = joints(20, 5)
-    T = transform_from_xyzrpy(torch.tensor([2.0, -1, 0.5, 1, 0.1, -0.2], dtype=torch.float64))
+    T = transform_from_xyz_zyx(torch.tensor([2.0, -1, 0.5, 1, 0.1, -0.2], dtype=torch.float64))
     T = T @ forward_kinematics(true_robot().geometric_robot, q)
     tracker = Measurements(q=q, position=T[:, :3, 3].contiguous(), frame=("tracker",) * 20)
     return join([tracker, touch_data(), socket_data(), wire_data(), pair_data(40)])

@@ -8,7 +8,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.se3 import invert, rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_vector, transform, transform_from_xyz_zyx
 
 TIP = np.array([0.05, -0.03, 0.2, 0.0, 0.0, 0.0])
 POINT = torch.tensor([0.4, 0.1, 0.3], dtype=torch.float64)
@@ -31,7 +31,7 @@ def touching_joints(
         turn = rng.uniform(-tilt, tilt, 3) * (1 if axis is None else np.eye(3)[axis])
         place = POINT if places is None else places[len(chosen)].double()
         T = transform(rotation_from_vector(torch.from_numpy(turn)) @ DOWN, place)
-        branches = solver.solve(T @ invert(transform_from_xyzrpy(torch.from_numpy(TIP)))).q
+        branches = solver.solve(T @ invert(transform_from_xyz_zyx(torch.from_numpy(TIP)))).q
         reached = branches[torch.isfinite(branches).all(-1)]
         if len(reached):
             chosen.append(reached[0])

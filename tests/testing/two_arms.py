@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 
 UR5 = Robot.load("ur5")
 FREE = ("theta_2", "theta_3", "theta_4", "theta_5")
@@ -28,9 +28,9 @@ FRAMES = {"hall": np.array([0.6, -0.5, 0.0, 0.4, 0.0, 0.1]), "jig": np.array([0.
 """Poses of frames in the base of the first arm."""
 
 
-def pose_of(xyzrpy: np.ndarray) -> torch.Tensor:
+def pose_of(xyz_zyx: np.ndarray) -> torch.Tensor:
     """Return a transform."""
-    return transform_from_xyzrpy(torch.from_numpy(xyzrpy))
+    return transform_from_xyz_zyx(torch.from_numpy(xyz_zyx))
 
 
 def true_arm(number: int, seed: int, frame: str = "") -> Robot:
@@ -41,7 +41,7 @@ def true_arm(number: int, seed: int, frame: str = "") -> Robot:
         values[int(name[-1]) - 1, 0] += rng.normal(0, 5e-4)
     base = np.zeros(6)
     if frame:
-        base = xyzrpy_from_transform(invert(pose_of(FRAMES[frame])) @ pose_of(BASES[number])).numpy()
+        base = xyz_zyx_from_transform(invert(pose_of(FRAMES[frame])) @ pose_of(BASES[number])).numpy()
     return UR5.with_geometry(values, base=base, tool=TOOL)
 
 
@@ -144,7 +144,7 @@ def rows_now(number: int, seed: int, bump: torch.Tensor, body: str, rows: int = 
     base, hall = pose_of(BASES[number]), pose_of(FRAMES["hall"])
     base = bump @ base if body == ("left", "right")[number] else base
     hall = bump @ hall if body == "hall" else hall
-    moved = true_arm(number, seed).with_geometry(base=xyzrpy_from_transform(invert(hall) @ base).numpy())
+    moved = true_arm(number, seed).with_geometry(base=xyz_zyx_from_transform(invert(hall) @ base).numpy())
     q = torch.from_numpy(rng.uniform(-2.2, 2.2, (rows, 6)))
     position = forward_kinematics(moved, q)[:, :3, 3] + torch.from_numpy(rng.normal(0, NOISE, (rows, 3)))
     return Measurements(q=q, position=position, frame=("hall",) * rows)

@@ -16,7 +16,7 @@ from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 from pisigma.workbench.workbench import Workbench
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
@@ -153,7 +153,7 @@ def reachable_pose(cell: Cell, rows: Path) -> dict[str, str]:
     q = Measurements.read_csv(rows, cell.robot).q
     T = forward_kinematics(cell.model.robot, q)
     (reached, *_) = (load(cell.folder)(T).status == Status.REACHED).nonzero()[:, 0].tolist()
-    x, y, z, *angles = xyzrpy_from_transform(T[reached]).tolist()
+    x, y, z, *angles = xyz_zyx_from_transform(T[reached]).tolist()
     values = (1e3 * x, 1e3 * y, 1e3 * z, *map(math.degrees, angles))
     return dict(zip(POSE_COLUMNS, map(repr, values), strict=True))
 

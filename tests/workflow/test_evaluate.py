@@ -9,7 +9,7 @@ from testing.refusals import refused
 
 import pisigma
 from pisigma.files.errors import MeasurementError
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.held_out.model_comparison import ModelFigures, QuantityErrors
 from pisigma.validation.resampling import Bootstrap
 from pisigma.workflow.settings.evaluation import EvaluationSettings, Limits
@@ -97,7 +97,7 @@ def test_models_and_rows_in_memory():
 def test_a_base_or_a_tool_that_has_moved_is_named():
     """Without a limit, and where errors are plausible; fitted, it is fine."""
     model, q, T = calibrated_ur5(40)
-    X = transform_from_xyzrpy(torch.tensor([5e-3, 0.0, 0.0, 1e-3, 0.0, 0.0]).double())
+    X = transform_from_xyz_zyx(torch.tensor([5e-3, 0.0, 0.0, 1e-3, 0.0, 0.0]).double())
     for poses, what, fitted in (
         (X @ T, "base", EvaluationSettings(fit_frame=True, bootstrap=Bootstrap(20))),
         (T @ X, "tool", EvaluationSettings(fit_tool=True, bootstrap=Bootstrap(20))),

@@ -19,7 +19,7 @@ from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.workflow.recalibrate import NOT_TRUSTED, Recalibration, recalibrate
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -66,7 +66,7 @@ def test_a_base_that_is_stated_to_have_moved_is_identified_again():
         original_model(), rows_after_change(10, 2, base=motion), RecalibrationSettings(moved=("base",))
     )
     assert result.summary.relocated_frames == ("base",)
-    T = transform_from_xyzrpy(torch.tensor(motion).double())
+    T = transform_from_xyz_zyx(torch.tensor(motion).double())
     before, after = (torch.from_numpy(one.bases[""][:3].copy()) for one in (original_model(), result.model))
     assert_close(after, T[:3, :3] @ before + T[:3, 3], atol=1e-3)
 

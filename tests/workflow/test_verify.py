@@ -17,14 +17,14 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import nominal_poses_of_rows
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.workflow.settings.verification import VerificationSettings
 from pisigma.workflow.verify import read_for_verification, verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 ROWS = 30
-FRAME = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
+FRAME = transform_from_xyz_zyx(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from torch import Tensor
 from jig_recipe import JigCalibration, JigRecipe
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.simulation.true_robot import TrueRobot
 from straight_lines import Controller
 
@@ -103,7 +103,7 @@ def measure_accuracy(bench: Bench, calibration: JigCalibration) -> Accuracy:
     seen_from = {}
     for placement in bench.recipe.placements:
         if placement.name in calibration.bases:
-            believed = transform_from_xyzrpy(torch.from_numpy(calibration.bases[placement.name]))
+            believed = transform_from_xyz_zyx(torch.from_numpy(calibration.bases[placement.name]))
             seen_from[placement.name] = _moved(placement.true_T_jig_base, reached) - _moved(believed, wanted)
     predicted = forward_kinematics(calibration.arm, bench.workspace)[:, :3, 3]
     distance = (bench.true_positions - predicted).norm(dim=-1)

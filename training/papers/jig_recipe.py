@@ -21,7 +21,7 @@ from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.jacobian import singularity_measure
-from pisigma.robot.se3 import rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_zyx, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.noise import SensorNoise
 from pisigma.simulation.poses import CubeRandom
@@ -257,5 +257,5 @@ def calibrate_on(
 
 
 def _pose(xyz_mm: Triple, rpy_deg: Triple) -> Float64[Tensor, "4 4"]:
-    R = rotation_from_rpy(torch.deg2rad(torch.tensor(rpy_deg, dtype=torch.float64)))
+    R = rotation_from_zyx(torch.deg2rad(torch.tensor(rpy_deg, dtype=torch.float64)))
     return transform(R, torch.tensor(xyz_mm, dtype=torch.float64) / 1e3)

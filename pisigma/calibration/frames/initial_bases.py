@@ -11,7 +11,7 @@ from pisigma.calibration.frames.shared_objects import JOINT, TOUCH, ArmPosterior
 from pisigma.calibration.frames.touch_equations import TipPositions
 from pisigma.files.errors import IdentificationError, Phrase
 from pisigma.robot.frame_fits import MeasuredPoses, best_base
-from pisigma.robot.se3 import invert, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform, transform_from_xyz_zyx
 
 _MIN_POINTS = 3
 COLLINEAR = 1e-3
@@ -26,7 +26,7 @@ def shared_object_in_base(
     frame, rows = arm.shared_objects[key]
     if key[0] == JOINT:
         return frame_after_rows(values(rows)), values(())
-    T_base_frame = invert(transform_from_xyzrpy(values(arm.base_rows(frame))))
+    T_base_frame = invert(transform_from_xyz_zyx(values(arm.base_rows(frame))))
     if key[0] == "frame":
         return T_base_frame, values(())
     point = transform(torch.eye(3, dtype=torch.float64), values(rows[:3]))

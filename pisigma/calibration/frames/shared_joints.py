@@ -21,7 +21,7 @@ from pisigma.robot.kinematics.components import (
     rotate_z,
     translate,
 )
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 
 
 def frame_after_rows(dh: Float64[Tensor, " parameters"]) -> Float64[Tensor, "4 4"]:
@@ -79,13 +79,13 @@ def with_common_joints(
         offsets = values[shared : shared + 2] + torch.stack(
             [torch.atan2(between[1, 0], between[0, 0]), between[2, 3]]
         )
-        there = transform_from_xyzrpy(values[bases.start : bases.stop].view(-1, 6)) @ invert(T_new_old)
+        there = transform_from_xyz_zyx(values[bases.start : bases.stop].view(-1, 6)) @ invert(T_new_old)
         return torch.cat(
             [
                 theirs,
                 offsets,
                 values[shared + 2 : bases.start],
-                xyzrpy_from_transform(there).flatten(),
+                xyz_zyx_from_transform(there).flatten(),
                 values[bases.stop :],
             ]
         )

@@ -17,7 +17,7 @@ from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 TOUCH, JOINT = "touch", "joint"
 """Kinds of objects that arms share if the tip of one touches that of another, and if they are on one torso."""
@@ -164,7 +164,7 @@ class ArmPosterior:
         base, tool = self.space.indices_of("base"), self.space.indices_of("tool")
         columns[..., base.start : base.stop if tip is None else tool.stop] = 0.0
         robot = known.geometry.robot
-        T_base = transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))
+        T_base = transform_from_xyz_zyx(torch.from_numpy(robot.base.copy()))
         bare = robot.with_geometry(base=np.zeros(6), tool=tools[self.space.targets[number]])
         return forward_kinematics(bare, postures.q_corrected), T_base[:3, :3].mT @ columns
 

@@ -9,7 +9,7 @@ from pisigma.files.errors import IdentificationError, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 
 def predicted_poses(
@@ -52,6 +52,6 @@ def _of_rows(
                 at=measurements.place_of(row, what),
                 remedy=nearest_choice(name, order),
             )
-    T = transform_from_xyzrpy(torch.from_numpy(np.stack([frames[name] for name in order])))
+    T = transform_from_xyz_zyx(torch.from_numpy(np.stack([frames[name] for name in order])))
     index = torch.tensor([order.index(name) for name in names], dtype=torch.int64)
     return T[index].to(measurements.q.device)

@@ -16,7 +16,7 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_zyx
 
 USUAL: Direction = (0.0, 0.0, -1.0)
 """Direction of gravity in the base frame of a robot on the floor."""
@@ -40,7 +40,7 @@ _UPDATES = 8
 
 def to_first_row_frame(robot: Robot, direction: Direction) -> Direction:
     """Return a direction in the robot's base frame, transformed to the frame of its first row."""
-    turned = rotation_from_rpy(torch.tensor(robot.base[3:])).mT @ torch.tensor(direction).double()
+    turned = rotation_from_zyx(torch.tensor(robot.base[3:])).mT @ torch.tensor(direction).double()
     x, y, z = (turned + 0.0).tolist()
     return x, y, z
 
@@ -182,7 +182,7 @@ def gravity_in_base(robot: Robot, features: Sequence[AbstractFeature]) -> Direct
     directions = [chosen.gravity for chosen in features if isinstance(chosen, GravityTorques)]
     if not directions:
         return None
-    turned = rotation_from_rpy(torch.tensor(robot.base[3:])) @ torch.tensor(directions[0]).double()
+    turned = rotation_from_zyx(torch.tensor(robot.base[3:])) @ torch.tensor(directions[0]).double()
     x, y, z = turned.tolist()
     return x, y, z
 

@@ -19,8 +19,8 @@ from pisigma.robot.se3 import (
     rotation_vector,
     skew,
     transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
 )
 
 MAX_ITERATIONS = 50
@@ -89,10 +89,10 @@ class ApproximationProblem:
         count = len(self.parameters)
         dh = robot.dh.copy()
         dh.reshape(-1)[list(self.parameters)] += step[:count].numpy()
-        base, tool = (transform_from_xyzrpy(torch.from_numpy(f.copy())) for f in (robot.base, robot.tool))
+        base, tool = (transform_from_xyz_zyx(torch.from_numpy(f.copy())) for f in (robot.base, robot.tool))
         base, tool = _small(step[count : count + 6]) @ base, tool @ _small(step[count + 6 :])
         return robot.with_geometry(
-            dh, xyzrpy_from_transform(base).numpy(), xyzrpy_from_transform(tool).numpy()
+            dh, xyz_zyx_from_transform(base).numpy(), xyz_zyx_from_transform(tool).numpy()
         )
 
 

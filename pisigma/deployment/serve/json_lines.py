@@ -33,7 +33,7 @@ from pisigma.files.errors import (
     nearest_choice,
 )
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.robot.kernels.array_kinematics import xyzrpy_of
+from pisigma.robot.kernels.array_kinematics import xyz_zyx_of
 from pisigma.robot.kinematics.status import Status
 
 MAX_LINE_BYTES = 2**20
@@ -315,7 +315,7 @@ def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str
     """Compute the pose of the calibrated arm."""
     q = _joints(model, request, "q_deg", "q")
     approach = read_numbers(request, "approach", len(q)) if "approach" in request else None
-    x, y, z, *angles = xyzrpy_of(model.ik.forward(q, approach=approach))
+    x, y, z, *angles = xyz_zyx_of(model.ik.forward(q, approach=approach))
     values: dict[str, Any] = {"pose": [x * 1e3, y * 1e3, z * 1e3, *map(math.degrees, angles)]}
     if read_flag(request, "accuracy"):
         values["accuracy_mm"] = _millimetres(model.ik.accuracy(q, approach=approach))

@@ -13,7 +13,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
-from pisigma.robot.se3 import invert, pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, pose_error, transform_from_xyz_zyx
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 
 FrameChoice = Literal["fitted", "fixed"]
@@ -139,7 +139,7 @@ def frames_of(
         (model.bases, model.tools) if model.hybrid is None else (model.hybrid_bases, model.hybrid_tools)
     )
     base, tool = bases.get(frame_names[0], robot.base), tools.get(frame_names[1], robot.tool)
-    T = [transform_from_xyzrpy(torch.from_numpy(np.array(frame))) for frame in (base, tool)]
+    T = [transform_from_xyz_zyx(torch.from_numpy(np.array(frame))) for frame in (base, tool)]
     return T[0], T[1]
 
 

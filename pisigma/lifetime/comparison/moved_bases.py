@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.calibration.frames.shared_objects import ArmPosterior, is_determined
 from pisigma.files.errors import IdentificationError, Phrase
 from pisigma.model.frame_model import FittedFrames
-from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyz_zyx
 
 _FALSE_ALARMS = 1e-3
 """Probability that arms and frames that did not move are reported to have moved."""
@@ -70,10 +70,10 @@ class RemeasuredArm:
         """
         before = self.posterior.values[list(self.posterior.base_rows(frame))]
         now = torch.from_numpy(self.current_frames.fit.solved.geometry.bases[frame].copy())
-        T_first_frame = self.T_first_base @ invert(transform_from_xyzrpy(before))
+        T_first_frame = self.T_first_base @ invert(transform_from_xyz_zyx(before))
 
         def motion(bases: Tensor) -> Tensor:
-            T_now, T_before = transform_from_xyzrpy(bases)
+            T_now, T_before = transform_from_xyz_zyx(bases)
             D = T_first_frame @ T_now @ invert(T_before) @ invert(T_first_frame)
             return torch.cat([D[:3, 3], rotation_vector(D[:3, :3])])
 
@@ -256,4 +256,4 @@ def _origin(
         return arm.T_first_base[:3, 3]
     arm = next(arms[number] for number, frame in owners if frame == name)
     before = arm.posterior.values[list(arm.posterior.base_rows(name))]
-    return (arm.T_first_base @ invert(transform_from_xyzrpy(before)))[:3, 3]
+    return (arm.T_first_base @ invert(transform_from_xyz_zyx(before)))[:3, 3]

@@ -17,7 +17,7 @@ from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.calibrated_model import CalibratedModel, corrected_joints
 from pisigma.robot.frame_fits import LEVER_SHARE
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
-from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
+from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyz_zyx_from_transform
 
 _MODEL_ERROR = 2e-5
 """Standard deviation of predicted coordinates [m] in addition to that of the posteriors, about a robot's
@@ -247,7 +247,7 @@ class ParameterEffects:
 
 
 def _geometry(frames: Frames) -> list[Float64[np.ndarray, " 6"]]:
-    return [xyzrpy_from_transform(frame).numpy() for frame in frames]
+    return [xyz_zyx_from_transform(frame).numpy() for frame in frames]
 
 
 def _corrected(model: CalibratedModel, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses dof"]:

@@ -30,7 +30,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.robot_class import plausible_error_per_reach
-from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows_diagnostic
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import ErrorPredictor, pose_errors_of
@@ -279,13 +279,13 @@ def _taken_along(frames: Frames, from_: Frames, onto: Frames, before: bool) -> F
             continue
         own, was = T["own"][name], T["from"][name]
         taken = there @ invert(was) @ own if before else own @ invert(was) @ there
-        moved[name] = xyzrpy_from_transform(taken).numpy()
+        moved[name] = xyz_zyx_from_transform(taken).numpy()
     return moved
 
 
 def _transforms(frames: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
     return {
-        name: transform_from_xyzrpy(torch.from_numpy(np.asarray(frame))) for name, frame in frames.items()
+        name: transform_from_xyz_zyx(torch.from_numpy(np.asarray(frame))) for name, frame in frames.items()
     }
 
 

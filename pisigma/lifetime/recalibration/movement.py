@@ -16,7 +16,7 @@ from pisigma.estimation.drift import DriftGroup
 from pisigma.lifetime.recalibration.adaptation import Adaptation
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem, frame_slice
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
-from pisigma.robot.se3 import rotation_vector, transform_from_xyzrpy
+from pisigma.robot.se3 import rotation_vector, transform_from_xyz_zyx
 
 CLEAR = 3.3
 """Standard deviations above which a movement is significant: chance exceeds them in one of 1,000 cases."""
@@ -182,7 +182,9 @@ def _of_frame(
     motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
     motion[column], covariance[column[:, None], column] = shift, of_members
     if group.fixed_size:  # relocated: `shift` is relative to the initial guess, not to the frame of the model
-        old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
+        old, new = (
+            transform_from_xyz_zyx(torch.from_numpy(np.asarray(one[name]))) for one in (before, after)
+        )
         turn = rotation_vector(new[:3, :3] @ old[:3, :3].mT)
         motion = torch.cat([new[:3, 3] - old[:3, 3], turn])
         if kind == "base":

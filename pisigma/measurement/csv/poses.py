@@ -21,7 +21,7 @@ from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import UnusableRow
 from pisigma.measurement.readings import to_si
 from pisigma.robot.row import MAX_MAGNITUDE
-from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_zyx, transform
 
 CHUNK_ROWS = 20_000
 """Number of rows that are in memory at a time."""
@@ -208,7 +208,7 @@ class _Layout:
                 faults[row] = Fault("", QUATERNION[0], expected, norm, "normalise it")
             R = rotation_from_quaternion(angles)
         else:
-            R = rotation_from_rpy(angles)
+            R = rotation_from_zyx(angles)
         sound = torch.ones(len(values), dtype=torch.bool)
         sound[list(faults)] = False
         return transform(R, position), sound

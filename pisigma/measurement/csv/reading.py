@@ -30,7 +30,7 @@ from pisigma.measurement.foreign.quantities import KEYS
 from pisigma.measurement.readings import READINGS, text_columns, to_si
 from pisigma.measurement.rules import FieldLabels, group_faults, row_faults
 from pisigma.robot import Robot
-from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_zyx
 
 _MAX_BYTES = 2**22
 """Largest size [bytes] of a refused file that is tested for being an export, so that a refusal does not take long."""
@@ -159,7 +159,7 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
             values = numbers(*field.quantities)
             fields[field.name] = values if len(field.quantities) > 1 else values[:, 0]
     if layout.orientation:
-        to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
+        to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_zyx
         fields["rotation"] = to_rotation(numbers(*layout.orientation))
     for column in layout.per_joint:
         name, number = column.joint_field

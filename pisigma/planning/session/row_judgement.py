@@ -32,10 +32,10 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import (
     invert,
-    rotation_from_rpy,
-    rpy_from_rotation,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
+    rotation_from_zyx,
+    transform_from_xyz_zyx,
+    xyz_zyx_from_transform,
+    zyx_from_rotation,
 )
 
 FALSE_ALARMS = 1e-3
@@ -285,13 +285,13 @@ def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[
     bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
     for number, frame in enumerate(setup.problem.space.frames):
         if frame in geometry.bases:
-            T = transform_from_xyzrpy(torch.from_numpy(geometry.bases[frame]))
-            bases[number] = xyzrpy_from_transform(invert(setup.reference_frames.bases[number]) @ T)
+            T = transform_from_xyz_zyx(torch.from_numpy(geometry.bases[frame]))
+            bases[number] = xyz_zyx_from_transform(invert(setup.reference_frames.bases[number]) @ T)
     for number, target in enumerate(setup.problem.space.targets):
         if target in geometry.tools:
             tool = torch.from_numpy(geometry.tools[target])
-            R = rotation_from_rpy(tool[3:]) @ setup.reference_frames.tools[number].mT
-            tools[number] = torch.cat([tool[:3], rpy_from_rotation(R)])
+            R = rotation_from_zyx(tool[3:]) @ setup.reference_frames.tools[number].mT
+            tools[number] = torch.cat([tool[:3], zyx_from_rotation(R)])
     point = setup.start.clone()
     for name, block in (("base", bases), ("tool", tools)):
         stretch = setup.problem.space.indices_of(name)

@@ -32,7 +32,7 @@ from pisigma.planning.session.state import AccuracyPoint, Advice, Alarm
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.tour import order_of_use, plan_tour
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 from pisigma.validation.checks.check import MOVES
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE
 from pisigma.validation.gate import check_rows
@@ -145,7 +145,7 @@ class SessionRows:
             at = replace(rows.select(usable), rotation=None)
             T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, at)
             those = [torch.from_numpy(geometry.bases[name]) for name in at.frame]
-            bases = transform_from_xyzrpy(torch.stack(those))
+            bases = transform_from_xyz_zyx(torch.stack(those))
             position[usable] = (invert(bases) @ T)[:, :3, 3]
             error[usable] = (bases[:, :3, :3].mT @ errors.position[..., None])[..., 0]
         return position.numpy(), error.numpy()

@@ -15,7 +15,7 @@ from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, Limits
 from pisigma.robot.row import BoundedFloat
-from pisigma.robot.se3 import rotation_from_rpy, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import rotation_from_zyx, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.simulation.errors.source import stated_joints
 
 Positive = Annotated[BoundedFloat, Field(gt=0)]
@@ -96,7 +96,7 @@ class Box(Section):
     @property
     def rotation(self) -> Float64[Tensor, "3 3"]:
         """Rotation matrix from the axes of the box to the robot's base frame."""
-        return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
+        return rotation_from_zyx(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
 
     def to_box_frame(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
         """Return points in the robot's base frame [m] transformed to the frame of the box."""
@@ -230,7 +230,7 @@ class ViewSection(Section):
     @property
     def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
         """Pose of the measuring frame in the frame of the nominal base [m]; None if it is not stated."""
-        return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
+        return None if self.frame is None else transform_from_xyz_zyx(torch.from_numpy(self.frame.to_si()))
 
     def sharp_depths(self, f: float) -> tuple[float, float]:
         """Return the nearest and the farthest depth [m] for a focal length f [px]."""
@@ -292,9 +292,9 @@ class Surroundings(Section):
         if self.tool is None:
             return robot
         nominal_tool, reflector = (
-            transform_from_xyzrpy(torch.tensor(tool)) for tool in (robot.tool, self.tool.to_si())
+            transform_from_xyz_zyx(torch.tensor(tool)) for tool in (robot.tool, self.tool.to_si())
         )
-        return robot.with_geometry(tool=xyzrpy_from_transform(nominal_tool @ reflector).numpy())
+        return robot.with_geometry(tool=xyz_zyx_from_transform(nominal_tool @ reflector).numpy())
 
     def capsules(self, robot: Robot) -> Capsules:
         """Return capsules along the links of a robot and the bracket of its reflector."""

@@ -197,9 +197,9 @@ def base_and_tool_matrices(robot: "pisigma.robot.description.Robot") -> np.ndarr
     return np.stack([transform_of(end)[:3] for end in (robot.base.tolist(), robot.tool.tolist())])
 
 
-def transform_of(xyzrpy: Any) -> np.ndarray:
+def transform_of(xyz_zyx: Any) -> np.ndarray:
     """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, `(4, 4)`, of lengths [m] and angles [rad]."""
-    return np.array(transform_entries(*xyzrpy)).reshape(4, 4)
+    return np.array(transform_entries(*xyz_zyx)).reshape(4, 4)
 
 
 def transform_entries(
@@ -212,7 +212,7 @@ def transform_entries(
     return (*first, *second, -s_p, c_p * s_y, c_p * c_y, z, 0.0, 0.0, 0.0, 1.0)
 
 
-def xyzrpy_of(T: Any) -> tuple[float, ...]:
+def xyz_zyx_of(T: Any) -> tuple[float, ...]:
     """Return x, y, z [m], roll, pitch and yaw [rad] of a transform `(4, 4)`: the inverse of `transform_of`.
 
     The pitch is within ±90 deg; at ±90 deg yaw is set to 0.

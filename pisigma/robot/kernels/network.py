@@ -70,7 +70,7 @@ def _input(description: Record, memory: Record, T: Array, q: Array, index: int) 
 
 @kernel
 def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None:
-    """Write the angles of a rotation relative to a reference; see `se3.rpy_from_rotation`."""
+    """Write the angles of a rotation relative to a reference; see `se3.zyx_from_rotation`."""
     for i in range(3):
         for k in range(3):
             R[i, k] = reference[0, i] * T[0, k] + reference[1, i] * T[1, k] + reference[2, i] * T[2, k]

@@ -127,9 +127,9 @@ def translate(frame: Frame, along_x: Scalar, along_y: Scalar, along_z: Scalar) -
     return x, y, z, p
 
 
-def compose_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
+def compose_xyz_zyx(frame: Frame, xyz_zyx: Sequence[Scalar]) -> Frame:
     """Return `frame · Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
-    x, y, z, roll, pitch, yaw = xyzrpy
+    x, y, z, roll, pitch, yaw = xyz_zyx
     moved = translate(frame, x, y, z)
     return rotate_x(rotate_y(rotate_z(moved, roll), pitch), yaw)
 

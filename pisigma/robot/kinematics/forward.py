@@ -14,7 +14,7 @@ from pisigma.robot.kinematics.components import (
     Scalar,
     add,
     as_transform,
-    compose_xyzrpy,
+    compose_xyz_zyx,
     product,
     rotate_x,
     rotate_y,
@@ -81,7 +81,7 @@ def iterate_rows(robot: Robot, geometry: Geometry, q: Sequence[Scalar]) -> Itera
         q: one joint value [rad or m] per joint, each a tensor of the batch shape.
     """
     values = iter(q)
-    frame = compose_xyzrpy(IDENTITY, geometry.base)
+    frame = compose_xyz_zyx(IDENTITY, geometry.base)
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, geometry.dh, strict=True):
         if row.type != "fixed":
             joint = product(float(row.direction), next(values))
@@ -134,4 +134,4 @@ def _forward_chunk(
     frame = IDENTITY
     for row in iterate_rows(robot, geometry, columns):
         frame = row.after
-    return as_transform(compose_xyzrpy(frame, geometry.tool), like=columns[0])
+    return as_transform(compose_xyz_zyx(frame, geometry.tool), like=columns[0])

@@ -12,7 +12,7 @@ from pisigma.robot.kinematics.components import (
     Frame,
     Scalar,
     as_transform,
-    compose_xyzrpy,
+    compose_xyz_zyx,
     cross,
     product,
     stack_components,
@@ -81,7 +81,7 @@ def motion_components(
         if row.type != "fixed":
             joints.append(frames.before)
         frame = frames.after
-    tool = compose_xyzrpy(frame, geometry.tool)
+    tool = compose_xyz_zyx(frame, geometry.tool)
     rows: list[list[Scalar]] = [[] for _ in range(6)]
     for joint, before in zip(robot.joints, joints, strict=True):
         axis, origin = before[2], before[3]

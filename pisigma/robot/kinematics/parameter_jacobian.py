@@ -223,13 +223,13 @@ def _turning(robot: Robot) -> Float64[np.ndarray, "rows dof"]:
     return turning
 
 
-def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "11 4 frames"]:
+def _frame_axes(xyz_zyx: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "11 4 frames"]:
     """Return rotation axes (roll, pitch, yaw), translation axes (x, y, z) and the frame x, y, z, origin, -x of frames.
 
     All are coefficients of the axes x, y, z and the origin before
     `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
     """
-    values = xyzrpy.cpu().numpy()
+    values = xyz_zyx.cpu().numpy()
     (cr, cp, cy), (sr, sp, sy) = np.cos(values[3:]), np.sin(values[3:])
     spsy, spcy = sp * sy, sp * cy
     x = (cr * cp, sr * cp, -sp)

@@ -25,7 +25,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import invert, rotation_from_rpy, rotation_from_vector, transform
+from pisigma.robot.se3 import invert, rotation_from_vector, rotation_from_zyx, transform
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.true_robot import TrueRobot
 
@@ -110,7 +110,7 @@ class RandomViews(Section):
         oblique, (near, far) = np.deg2rad(self.oblique_deg), self.distance_mm
         tilt, direction, roll, distance = rng.uniform((0, 0, 0, near), (oblique, 2 * np.pi, 2 * np.pi, far))
         angles = torch.tensor([[direction, tilt, 0.0], [roll, 0.0, 0.0]], dtype=torch.float64)
-        around, about_axis = rotation_from_rpy(angles)
+        around, about_axis = rotation_from_zyx(angles)
         middle = torch.from_numpy((board.corners.min(0) + board.corners.max(0)) / 2)
         return transform(around @ about_axis, middle - distance / 1e3 * around[:, 2])
 

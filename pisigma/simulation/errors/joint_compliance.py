@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.components import Frame, as_transform, compose_xyzrpy
+from pisigma.robot.kinematics.components import Frame, as_transform, compose_xyz_zyx
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values, row_index
 
@@ -95,7 +95,7 @@ def gravity_load(
     fall = q.new_tensor(gravity)
     total, moment = (
         payload.mass_kg,
-        _first_moment(payload, compose_xyzrpy(frames[-1].after, geometry.tool), q),
+        _first_moment(payload, compose_xyz_zyx(frames[-1].after, geometry.tool), q),
     )
     loads: list[Tensor] = []
     for index in reversed(range(len(frames))):

@@ -11,7 +11,7 @@ from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
 from pisigma.calibration.frames.shared_objects import TOUCH, Postures
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.yaml_file import Section, StoredFigures
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 Three = tuple[float, float, float]
@@ -142,7 +142,7 @@ def base_figures(
     shown = np.array([1e3] * 3 + [math.degrees(1)] * 3)
     in_mm_and_deg = covariance.numpy() * shown * shown[:, None]
     names = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
-    values = dict(zip(names, (xyzrpy_from_transform(T).numpy() * shown).tolist(), strict=True))
+    values = dict(zip(names, (xyz_zyx_from_transform(T).numpy() * shown).tolist(), strict=True))
     return ArmBaseFigures(
         arm=bases.arms[second_arm].name,
         other_arm=bases.arms[first_arm].name,

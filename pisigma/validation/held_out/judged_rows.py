@@ -19,7 +19,7 @@ from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.reference_models import nominal_model
@@ -162,7 +162,7 @@ def tool_positions(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Fl
     """Compute the position of the tool in the robot's base frame [m]."""
     T = model.forward(q)
     T = torch.where(torch.isfinite(T), T, forward_kinematics(model.robot, q))
-    base = transform_from_xyzrpy(torch.from_numpy(model.robot.base.copy()))
+    base = transform_from_xyz_zyx(torch.from_numpy(model.robot.base.copy()))
     return (invert(base) @ T)[:, :3, 3]
 
 

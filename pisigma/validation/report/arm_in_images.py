@@ -21,7 +21,7 @@ from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, po
 from pisigma.model.training_rows import known_rows
 from pisigma.robot.kinematics.components import as_transform
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
-from pisigma.robot.se3 import invert, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform, transform_from_xyz_zyx
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.reference_models import nominal_model
 
@@ -214,7 +214,7 @@ def _links(
     frames = list(iterate_rows(robot, Geometry.from_robot(robot), q.unbind(-1)))
     chain = [as_transform(frame, q[:, 0]) for frame in (frames[0].before, *(one.after for one in frames))]
     tool = torch.from_numpy(np.stack([np.asarray(tools.get(name, robot.tool)) for name in rows.target]))
-    T_frame_base = T @ invert(transform_from_xyzrpy(tool)) @ invert(chain[-1])
+    T_frame_base = T @ invert(transform_from_xyz_zyx(tool)) @ invert(chain[-1])
     origins = [(T_frame_base @ one)[:, :3, 3] for one in chain]
     return torch.stack([*origins, T[:, :3, 3]], 1)
 

@@ -24,7 +24,7 @@ from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.frame_model import frames_of_model
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.held_out.arms_summary import ArmsSummary, Six
 from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE
 
@@ -152,8 +152,8 @@ def _poses_in_first(summary: ArmsSummary) -> dict[str, Float64[Tensor, "4 4"]]:
     for one in summary.bases:
         if one.other_arm == first:
             angles = np.deg2rad([one.roll_deg, one.pitch_deg, one.yaw_deg])
-            xyzrpy = np.concatenate([np.array([one.x_mm, one.y_mm, one.z_mm]) / 1e3, angles])
-            poses[one.arm] = transform_from_xyzrpy(torch.from_numpy(xyzrpy))
+            xyz_zyx = np.concatenate([np.array([one.x_mm, one.y_mm, one.z_mm]) / 1e3, angles])
+            poses[one.arm] = transform_from_xyz_zyx(torch.from_numpy(xyz_zyx))
     return poses
 
 

@@ -14,7 +14,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 BASE = np.array([1.0, 0.2, -0.3, 0.5, -0.2, 0.3])
 UR5 = Robot.load("ur5")
@@ -165,7 +165,7 @@ def test_hand_eye_of_poses_gives_back_base_and_tool():
     assert_close(fit.estimates, np.concatenate([true.base, true.tool]), atol=1e-9)
     assert not fit.weak_directions
     predicted = fit.solved.result().predicted_poses(rows)
-    assert_close(xyzrpy_from_transform(predicted), xyzrpy_from_transform(T), atol=1e-9)
+    assert_close(xyz_zyx_from_transform(predicted), xyz_zyx_from_transform(T), atol=1e-9)
 
 
 def test_too_few_rows_are_refused():

@@ -9,13 +9,13 @@ from testing.simulated_arm import BASE, TOOL, draw_joints, simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.observability import observability_of
-from pisigma.calibration.geometric.problem.setup import rpy_axes
+from pisigma.calibration.geometric.problem.setup import zyx_axes
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_rpy, rotation_from_vector, rotation_vector, wrap_to_pi
+from pisigma.robot.se3 import rotation_from_vector, rotation_from_zyx, rotation_vector, wrap_to_pi
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +88,8 @@ def test_turning_axes_are_the_derivative_of_the_rotation() -> None:
     for index in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[index] = 1e-6
-        turn = rotation_vector(rotation_from_rpy(rpy + step) @ rotation_from_rpy(rpy - step).mT) / 2e-6
-        assert_close(rpy_axes(rpy)[:, index], turn, atol=1e-9)
+        turn = rotation_vector(rotation_from_zyx(rpy + step) @ rotation_from_zyx(rpy - step).mT) / 2e-6
+        assert_close(zyx_axes(rpy)[:, index], turn, atol=1e-9)
 
 
 def test_unknown_frames_and_targets_are_refused(result: CalibrationResult) -> None:

@@ -13,7 +13,7 @@ from pisigma.estimation.loss import SquaredLoss
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 # Park et al. 2022, Tables 9 and 10.
 ELIMINATED = {
@@ -129,7 +129,7 @@ def test_poses_reflectors_and_missing_rows_go_together() -> None:
     target = tuple("ABC"[row % 3] for row in range(90))
     still = arm.true.with_geometry(tool=np.zeros(6))
     tools = torch.from_numpy(np.stack([points[name] for name in target]))
-    T = forward_kinematics(still, arm.measurements.q) @ transform_from_xyzrpy(tools)
+    T = forward_kinematics(still, arm.measurements.q) @ transform_from_xyz_zyx(tools)
     position, rotation = T[:, :3, 3].clone(), T[:, :3, :3].clone()
     position[4], position[17], rotation[17], rotation[20:40] = (torch.nan,) * 4
     data = Measurements(q=arm.measurements.q, position=position, rotation=rotation, target=target)
@@ -139,14 +139,14 @@ def test_poses_reflectors_and_missing_rows_go_together() -> None:
     assert result.noise[1].values == 3 * 69
     assert np.isnan(result.residuals["position"][[4, 17]]).all()
     for name, point in points.items():
-        expected = transform_from_xyzrpy(torch.from_numpy(point))
+        expected = transform_from_xyz_zyx(torch.from_numpy(point))
         at_flange = torch.from_numpy(result.tools[name])
-        other = transform_from_xyzrpy(torch.from_numpy(result.tools["A"]))
-        first = transform_from_xyzrpy(torch.from_numpy(points["A"]))
+        other = transform_from_xyz_zyx(torch.from_numpy(result.tools["A"]))
+        first = transform_from_xyz_zyx(torch.from_numpy(points["A"]))
         # Only where the targets are to each other is seen: the last axis' errors are shared with the tool.
         between = (
             torch.linalg.solve(first, expected),
-            torch.linalg.solve(other, transform_from_xyzrpy(at_flange)),
+            torch.linalg.solve(other, transform_from_xyz_zyx(at_flange)),
         )
         assert_close(between[1], between[0], atol=1e-9)
     errors = result.errors_of(data)

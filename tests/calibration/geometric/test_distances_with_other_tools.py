@@ -18,7 +18,7 @@ from pisigma.files.errors import IdentificationError, ImplausibleError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -61,22 +61,22 @@ def seen_from(T_frame_robot: Tensor, anchors: int) -> Measurements:
 
 @pytest.mark.parametrize(("anchors", "off"), [(1, 0.137), (2, 1.0), (3, 1.0)])
 def test_neither_a_far_frame_nor_a_long_tool_has_to_be_drawn(anchors: int, off: float) -> None:
-    T = transform_from_xyzrpy(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
+    T = transform_from_xyz_zyx(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
     nominal = with_tool_off(off)
     result = GeometricCalibrator(nominal).fit(seen_from(T, anchors))
     assert result.status.is_minimum
     assert result.noise[0].sigma < 1e-6
     if anchors == 3:
-        found = transform_from_xyzrpy(torch.tensor(result.robot.base))
+        found = transform_from_xyz_zyx(torch.tensor(result.robot.base))
         assert_close(found, T, atol=5e-3)
 
 
 @pytest.mark.parametrize("anchors", [1, 2, 3])
 def test_anchors_at_stated_positions_determine_the_frame(anchors: int) -> None:
-    T = transform_from_xyzrpy(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
+    T = transform_from_xyz_zyx(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
     data = seen_from(T, anchors)
     tip = forward_kinematics(true_robot().geometric_robot, data.q)[:, :3, 3]
-    found = transform_from_xyzrpy(torch.tensor(base_from_anchors(data, data.frame[0], tip, np.zeros(6))))
+    found = transform_from_xyz_zyx(torch.tensor(base_from_anchors(data, data.frame[0], tip, np.zeros(6))))
     assert data.anchor_place is not None
     seen = data.anchor_place[:anchors] - found[:3, 3]
     assert_close(seen @ found[:3, :3], (data.anchor_place[:anchors] - T[:3, 3]) @ T[:3, :3], atol=1e-6)

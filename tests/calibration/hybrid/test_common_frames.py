@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.refinement import fit_rigid_motion, refine, with
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyz_zyx
 from pisigma.simulation import TrueRobot
 
 
@@ -78,10 +78,10 @@ def test_a_moved_frame_moves_what_stands_in_it_with_its_uncertainty():
     like = with_aligned_frames(solved, refined)
     assert_close(moved.bases[""], like.bases[""], atol=1e-9)
     assert moved.point is not None
-    base = moved.setup.reference_frames.bases[0] @ transform_from_xyzrpy(
+    base = moved.setup.reference_frames.bases[0] @ transform_from_xyz_zyx(
         turned[solved.problem.space.indices_of("base")]
     )
-    assert_close(transform_from_xyzrpy(torch.from_numpy(moved.bases[""])), base, atol=1e-12)
+    assert_close(transform_from_xyz_zyx(torch.from_numpy(moved.bases[""])), base, atol=1e-12)
     anchor = solved.problem.space.indices_of("anchor").start
     place = moved.coordinate_jacobian[anchor : anchor + 3, anchor : anchor + 3]
     assert_close(place, moved.setup.reference_frames.bases[0, :3, :3], atol=1e-12)

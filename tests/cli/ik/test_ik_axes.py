@@ -10,7 +10,7 @@ from testing.models import no_type_checker
 from testing.pose_files import write_poses
 
 from pisigma.model.folder.model_folder import save_model
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_axes_of_the_tool_that_do_not_count(run, calibrated_folder, tmp_path):
     T = model.forward(joints_of(model.robot, 3, seed=4, share=0.8))
     turned = T.clone()
     turned[:, :3, 0], turned[:, :3, 1] = T[:, :3, 1], -T[:, :3, 0]
-    rows = [[*(v[:3] * 1e3).tolist(), *torch.rad2deg(v[3:]).tolist()] for v in xyzrpy_from_transform(turned)]
+    rows = [[*(v[:3] * 1e3).tolist(), *torch.rad2deg(v[3:]).tolist()] for v in xyz_zyx_from_transform(turned)]
     write_poses(tmp_path / "poses.csv", rows)
     options = ("--ignore-axes", "yaw", "--tolerance-mm", "0.05")
     result = run(

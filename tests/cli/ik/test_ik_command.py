@@ -16,12 +16,12 @@ from pisigma.files.errors import MeasurementError, ModelError, OutputError, Pose
 from pisigma.model.inverse.corrected_ik import load
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 
 def pose_of(name: str, q: torch.Tensor) -> list[float]:
     """X Y Z ROLL PITCH YAW [mm, deg] of joint values."""
-    values = xyzrpy_from_transform(forward_kinematics(Robot.load(name), q))
+    values = xyz_zyx_from_transform(forward_kinematics(Robot.load(name), q))
     return [*(values[:3] * 1e3).tolist(), *torch.rad2deg(values[3:]).tolist()]
 
 

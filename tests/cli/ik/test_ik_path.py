@@ -13,7 +13,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyz_zyx_from_transform
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def arm(tmp_path_factory):
 
 def write(path, q):
     with no_type_checker():
-        values = xyzrpy_from_transform(forward_kinematics(Robot.load("ur5"), torch.from_numpy(q))).numpy()
+        values = xyz_zyx_from_transform(forward_kinematics(Robot.load("ur5"), torch.from_numpy(q))).numpy()
     rows = np.concatenate([values[:, :3] * 1e3, np.rad2deg(values[:, 3:])], -1).tolist()
     lines = ["x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg", *(",".join(map(repr, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n")

@@ -22,7 +22,7 @@ from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -93,7 +93,7 @@ def test_angles_of_a_pose_at_branch_cuts(pitch):
     near = torch.cat([quarters, quarters + 1e-9, quarters - 1e-9])
     roll, yaw = (part.flatten() for part in torch.meshgrid(near, near, indexing="ij"))
     zero = torch.zeros_like(roll)
-    T = transform_from_xyzrpy(torch.stack([zero, zero + 0.2, zero, roll, zero + pitch, yaw], -1))
+    T = transform_from_xyz_zyx(torch.stack([zero, zero + 0.2, zero, roll, zero + pitch, yaw], -1))
     q = zero[:, None].expand(-1, 4)
     found = run(export_onnx(model), q_nominal=q, T_base_tool=T)
     assert_close(found["correction"], model.correction(T, q), atol=1e-12)

@@ -20,7 +20,7 @@ from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 
 def rows_of(targets: Targets) -> list[dict[str, str]]:
@@ -31,7 +31,7 @@ def rows_of(targets: Targets) -> list[dict[str, str]]:
 def pose_in(row: dict[str, str]) -> torch.Tensor:
     lengths = [float(row[f"{name}_mm"]) / 1e3 for name in "xyz"]
     angles = [math.radians(float(row[f"{name}_deg"])) for name in ("roll", "pitch", "yaw")]
-    return transform_from_xyzrpy(torch.tensor([*lengths, *angles], dtype=torch.float64))
+    return transform_from_xyz_zyx(torch.tensor([*lengths, *angles], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])

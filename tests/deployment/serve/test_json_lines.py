@@ -18,7 +18,7 @@ from pisigma.deployment.serve import json_lines
 from pisigma.files.errors import missing_extra
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
-from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
+from pisigma.robot.kernels.array_kinematics import transform_of, xyz_zyx_of
 
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
 NEAR = [15.0, 3.0, -1.0, -85.0, 19.0, 92.0]
@@ -110,7 +110,7 @@ def test_ignored_axes_are_those_of_python(repository, tmp_path):
     save_model(model, tmp_path)
     ik = pisigma.load(tmp_path)
     T = np.asarray(ik.forward(np.array([0.3, -1.2, 1.4, -0.6, -1.2, 0.4])))
-    x, y, z, *angles = xyzrpy_of(T)
+    x, y, z, *angles = xyz_zyx_of(T)
     pose = [x * 1e3, y * 1e3, z * 1e3, *np.degrees(angles)]
     near = np.array([0.2, -1.0, 1.2, -0.5, -1.0, 1.4])
     with running(tmp_path) as server, json_client(server) as client:

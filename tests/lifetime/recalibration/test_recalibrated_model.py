@@ -13,7 +13,7 @@ from pisigma.lifetime.recalibration.recalibration_problem import recalibration_p
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
@@ -27,7 +27,7 @@ def recalibrated(rows, relocated=frozenset(), arm=True):
 
 
 def frame(values) -> torch.Tensor:
-    return transform_from_xyzrpy(torch.tensor(list(values)).double())
+    return transform_from_xyz_zyx(torch.tensor(list(values)).double())
 
 
 def test_the_model_is_the_same_after_writing_and_reading(tmp_path):

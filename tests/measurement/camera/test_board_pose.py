@@ -7,9 +7,9 @@ from testing.closeness import assert_close
 
 from pisigma.estimation.loss import HampelLoss
 from pisigma.measurement.camera.board_pose import solve_board_pose
-from pisigma.robot.se3 import rotation_from_rpy, rotation_vector
+from pisigma.robot.se3 import rotation_from_zyx, rotation_vector
 
-R = rotation_from_rpy(torch.tensor([0.4, 0.5, 3.0], dtype=torch.float64)).numpy()
+R = rotation_from_zyx(torch.tensor([0.4, 0.5, 3.0], dtype=torch.float64)).numpy()
 T = np.array([-0.1, 0.05, 0.5])
 
 

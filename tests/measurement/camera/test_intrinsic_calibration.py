@@ -15,7 +15,7 @@ from pisigma.measurement.camera.solved_images import (
     calibrate_intrinsics,
     initial_camera,
 )
-from pisigma.robot.se3 import rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_zyx
 from pisigma.simulation.camera.rendering import TrueBoard
 
 SIZE = (1920, 1200)
@@ -29,7 +29,7 @@ def views(count: int, tilt: float, seed: int = 0, noise: float = NOISE, bow: flo
     rng, chosen = np.random.default_rng(seed), list[BoardView]()
     while len(chosen) < count:
         rpy = np.append(rng.uniform(-np.pi, np.pi), rng.uniform(-tilt, tilt, 2))
-        R = rotation_from_rpy(torch.from_numpy(rpy)).numpy()
+        R = rotation_from_zyx(torch.from_numpy(rpy)).numpy()
         t = rng.uniform((-0.15, -0.1, 0.3), (0.15, 0.1, 0.5)) - R @ BOARD.corners.mean(0)
         pixels = TRUE.project(TrueBoard(BOARD, bow=bow).corners @ R.T + t)[0]
         if (pixels > 0).all() and (pixels < SIZE).all():

@@ -10,7 +10,7 @@ from testing.refusals import refused
 from pisigma.files import input_file
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.poses import read_pose_chunks, read_poses
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 RPY = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
 QUATERNION = "x_m,y_m,z_m,qx,qy,qz,qw"
@@ -26,14 +26,14 @@ def test_roll_pitch_yaw_in_degrees_and_millimetres(tmp_path):
     found = read(tmp_path, "# wanted", RPY, "100,-200,300,10,20,30", "", " 1e2 ,0,+5,0,0,-90")
     values = torch.tensor([[0.1, -0.2, 0.3, 10, 20, 30], [0.1, 0, 0.005, 0, 0, -90]], dtype=torch.float64)
     values[:, 3:] = torch.deg2rad(values[:, 3:])
-    assert_close(found.T, transform_from_xyzrpy(values), atol=1e-15)
+    assert_close(found.T, transform_from_xyz_zyx(values), atol=1e-15)
     assert found.line == (3, 5)
 
 
 def test_quaternions_metres_and_any_order_of_columns(tmp_path):
     half = 0.5**0.5
     found = read(tmp_path, QUATERNION, f"0.1,0.2,0.3,0,0,{half},{half}")
-    quarter = transform_from_xyzrpy(torch.tensor([[0.1, 0.2, 0.3, torch.pi / 2, 0, 0]], dtype=torch.float64))
+    quarter = transform_from_xyz_zyx(torch.tensor([[0.1, 0.2, 0.3, torch.pi / 2, 0, 0]], dtype=torch.float64))
     assert_close(found.T, quarter, atol=1e-15)
     mixed = read(tmp_path, "yaw_deg,z_mm,x_mm,roll_deg,y_mm,pitch_deg", "0,300,100,90,200,0")
     assert_close(mixed.T, quarter, atol=1e-15)

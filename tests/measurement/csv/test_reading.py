@@ -11,7 +11,7 @@ from testing.refusals import refused
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_zyx
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_reads_roll_pitch_yaw(write):
     measurements = Measurements.read_csv(
         write("q1_deg,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n0,1,2,3,10,20,30\n")
     )
-    expected = rotation_from_rpy(torch.deg2rad(torch.tensor([[10, 20, 30]], dtype=torch.float64)))
+    expected = rotation_from_zyx(torch.deg2rad(torch.tensor([[10, 20, 30]], dtype=torch.float64)))
     assert_close(measurements.rotation, expected, atol=1e-15)
     assert measurements.kinds == {"pose"}
 

@@ -16,7 +16,7 @@ from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import TEMPERATURES
 from pisigma.robot import Robot
-from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_zyx
 
 TEXT = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=6).filter(
     lambda text: text == text.strip()
@@ -103,7 +103,7 @@ def test_reads_back_what_was_written(tmp_path: Path, data: st.DataObject, rows: 
 def test_rotations_keep_their_digits_where_angles_are_singular(tmp_path: Path, roll: float, pitch: float):
     yaw = [-180.0, -1e-7, 0.0, 60.0, 180.0]
     rpy = torch.deg2rad(tensor([[roll, pitch, angle] for angle in yaw]))
-    measurements = Measurements(q=torch.arange(5.0).double()[:, None], rotation=rotation_from_rpy(rpy))
+    measurements = Measurements(q=torch.arange(5.0).double()[:, None], rotation=rotation_from_zyx(rpy))
     measurements.write_csv(tmp_path / "data.csv")
     assert_close(Measurements.read_csv(tmp_path / "data.csv").rotation, measurements.rotation, atol=1e-15)
     scalar_parts = [

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 
 from pisigma.measurement.foreign.rotations import ROTATIONS, encodings_of
-from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_zyx
 
 ANGLES = np.random.default_rng(1).uniform(-1.4, 1.4, (20, 3))
 
@@ -56,7 +56,7 @@ def test_columns_of_measurement_files_mean_the_same(name: str):
     encoding = ROTATIONS[name]
     values = torch.from_numpy(ANGLES if encoding.is_angles else Rotation.from_rotvec(ANGLES).as_quat())
     names = ("roll", "pitch", "yaw") if encoding.is_angles else ("qx", "qy", "qz", "qw")
-    to_rotation = rotation_from_rpy if encoding.is_angles else rotation_from_quaternion
+    to_rotation = rotation_from_zyx if encoding.is_angles else rotation_from_quaternion
     columns = values[:, [encoding.columns.index(column) for column in names]]
     assert_close(encoding.to_rotation(values), to_rotation(columns), atol=1e-14)
 

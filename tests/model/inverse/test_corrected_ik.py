@@ -17,7 +17,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 ROBOTS = tuple(HOMES)
 
@@ -153,7 +153,7 @@ def test_values_are_nan_only_where_unreachable(name):
     xyz = reach * (2 * torch.rand(60, 3, generator=generator, dtype=torch.float64) - 1)
     rpy = torch.zeros_like(xyz) if name == "kiro3" else 2 * xyz
     solution = CorrectedIK(hand_made_model(name)).all_branches(
-        transform_from_xyzrpy(torch.cat([xyz, rpy], -1))
+        transform_from_xyz_zyx(torch.cat([xyz, rpy], -1))
     )
     lost = solution.status == Status.UNREACHABLE
     assert bool(lost.any())

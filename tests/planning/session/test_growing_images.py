@@ -19,7 +19,7 @@ from pisigma.planning.session.growing_images import growing_file
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, xyz_zyx_from_transform
 from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.settings.measuring import MeasureSettings
@@ -48,7 +48,7 @@ def lines(plan: StoredPlan) -> list[str]:
     assert settings is not None
     assert view is not None
     assert view.T_cell_frame is not None
-    base = xyzrpy_from_transform(invert(view.T_cell_frame)).numpy()
+    base = xyz_zyx_from_transform(invert(view.T_cell_frame)).numpy()
     errors = np.random.default_rng(0).standard_normal(robot.dh.shape) * [9e-4, 4e-4, 4e-4, 1e-3, 1e-3]
     true = robot.with_geometry(robot.dh + errors, base=base, tool=robot.tool + 2e-3)
     camera, board = Camera.load(settings.camera), Board.load(settings.board)

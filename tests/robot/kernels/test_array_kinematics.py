@@ -17,7 +17,7 @@ from pisigma.robot import Robot, catalogue
 from pisigma.robot.kernels import array_kinematics, machine_code
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -104,7 +104,7 @@ def test_calibrated_arms(hybrid):
 
 def test_transforms_of_numbers():
     for numbers in np.random.default_rng(0).normal(size=(5, 6)):
-        expected = transform_from_xyzrpy(torch.from_numpy(numbers))
+        expected = transform_from_xyz_zyx(torch.from_numpy(numbers))
         assert_close(array_kinematics.transform_of(numbers.tolist()), expected, atol=1e-15)
 
 

@@ -14,7 +14,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import pose_error, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import pose_error, transform, transform_from_xyz_zyx
 
 RIGHT = math.pi / 2
 BATCHES = [(), (1,), (3, 1, 2), (0,)]
@@ -141,7 +141,7 @@ def test_batched_equals_looped_in_every_shape_and_dtype(name, robots, generator,
 def test_poses_out_of_reach_are_nan_with_a_status(name, robots):
     robot = _family(robots)[name]
     solutions = closed_form_solver(robot).solve(
-        transform_from_xyzrpy(torch.full((2, 6), 9.0, dtype=torch.float64))
+        transform_from_xyz_zyx(torch.full((2, 6), 9.0, dtype=torch.float64))
     )
     assert (solutions.status == Status.UNREACHABLE).all()
     assert torch.isnan(solutions.q).all()
@@ -172,7 +172,7 @@ def test_a_wrist_centre_inside_the_dead_cylinder_is_unreachable(robots, generato
 
 
 def test_a_tilted_tool_is_unreachable_for_a_scara(robots):
-    T = transform_from_xyzrpy(
+    T = transform_from_xyz_zyx(
         torch.tensor([[0.3, 0.2, 0.3, 0.5, tilt, 0.0] for tilt in (0.0, 1e-6, 0.3, math.pi)])
     )
     solutions = closed_form_solver(robots.load("kiro3")).solve(T.double())
@@ -271,7 +271,7 @@ def test_full_turns_bring_a_joint_inside_or_the_status_says_outside(robots, lowe
 
 
 def test_a_prismatic_joint_beyond_its_stroke_is_outside_its_limits(robots):
-    T = transform_from_xyzrpy(torch.tensor([0.3, 0.2, 0.5, 0.0, 0.0, 0.0], dtype=torch.float64))
+    T = transform_from_xyz_zyx(torch.tensor([0.3, 0.2, 0.5, 0.0, 0.0, 0.0], dtype=torch.float64))
     solutions = closed_form_solver(robots.load("kiro3")).solve(T)
     assert (solutions.status == Status.OUTSIDE_JOINT_LIMITS).all()
     assert_close(solutions.q[:, 2], 0.053, atol=1e-12)

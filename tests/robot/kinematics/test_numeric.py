@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import characteristic_length, joint_jacobian, singularity_measure
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import pose_error, transform_from_xyz_zyx
 
 
 def _unlimited(robot):
@@ -103,7 +103,7 @@ def test_a_start_at_the_solution_needs_no_step(robots, generator):
 def test_unreachable_poses_do_not_converge_but_decrease_the_error(name, pose, robots):
     robot = robots.load(name)
     T, start = (
-        transform_from_xyzrpy(torch.tensor(pose, dtype=torch.float64)),
+        transform_from_xyz_zyx(torch.tensor(pose, dtype=torch.float64)),
         torch.full((robot.dof,), 0.3).double(),
     )
     solution = solve_numeric(robot, T, start)

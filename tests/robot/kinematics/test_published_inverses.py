@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close, joint_distance
 
 from pisigma.robot.kinematics.closed_form import closed_form_solver
-from pisigma.robot.se3 import rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_zyx, transform
 
 RIGHT = math.pi / 2
 
@@ -30,7 +30,7 @@ def test_appendix_a_as_printed_agrees(robots, generator):
     p = torch.stack([radius * angle.cos(), radius * angle.sin(), z / 10], -1)
     zero = torch.zeros_like(phi)
     solutions = closed_form_solver(robot).solve(
-        transform(rotation_from_rpy(torch.stack([phi, zero, zero], -1)), p)
+        transform(rotation_from_zyx(torch.stack([phi, zero, zero], -1)), p)
     )
     assert solutions.branches == ("elbow_positive", "elbow_negative")
     for branch, sign in enumerate((1, -1)):
@@ -73,7 +73,7 @@ def test_appendix_b_as_printed_agrees(robots, generator):
     u = torch.rand((300, 6), generator=generator, dtype=torch.float64)
     p = torch.tensor([0.6, 0.0, 0.4]) + 0.4 * u[:, :3]
     home = torch.tensor([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]], dtype=torch.float64)
-    R = home @ rotation_from_rpy((u[:, 3:] - 0.5) * RIGHT)
+    R = home @ rotation_from_zyx((u[:, 3:] - 0.5) * RIGHT)
     solutions = closed_form_solver(robot).solve(transform(R, p))
     for sign in (1, -1):
         for wrist in (1, -1):

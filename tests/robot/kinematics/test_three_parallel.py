@@ -11,7 +11,7 @@ from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.closed_form.three_parallel import ThreeParallelArm
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import pose_error, transform_from_xyz_zyx
 
 RIGHT = math.pi / 2
 
@@ -220,7 +220,7 @@ def test_a_straight_wrist_rotates_if_joint_6_at_zero_does_not_reach(bend, robots
 
 
 def test_poses_out_of_reach_are_unreachable(robots):
-    T = transform_from_xyzrpy(
+    T = transform_from_xyz_zyx(
         torch.tensor([[1.3, 0.0, 0.3, 0.1, 0.2, 0.3], [0.0, 0.05, 0.3, 0.4, -0.3, 1.7]], dtype=torch.float64)
     )
     solutions = closed_form_solver(robots.load("ur5")).solve(T)
@@ -231,7 +231,7 @@ def test_poses_out_of_reach_are_unreachable(robots):
 def test_the_wrist_cannot_be_near_axis_1(robots):
     """The intersection of axes 5 and 6 has at least the distance d_2 + d_3 + d_4 from axis 1."""
     robot = robots.load("ur5")
-    T = transform_from_xyzrpy(torch.tensor([0.05, 0.0, 0.5 + 0.0823, 0.0, 0.0, 0.0], dtype=torch.float64))
+    T = transform_from_xyz_zyx(torch.tensor([0.05, 0.0, 0.5 + 0.0823, 0.0, 0.0, 0.0], dtype=torch.float64))
     assert (closed_form_solver(robot).solve(T).status == Status.UNREACHABLE).all()
 
 

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.robot.se3 import rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_zyx
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 
 CAMERA = Camera("small", 640, 400, 500.0, 500.0, 319.5, 199.5, -0.1, 0.05, 1e-4, -2e-4, 0.01)
@@ -21,7 +21,7 @@ SHARP = Exposure(blur_in_focus=1e-3, aperture_diameter=0.0, vignetting=0.0, grad
 def pose(distance: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """Return T_camera_board with the centre of the corners on the camera's axis."""
     T = np.eye(4)
-    T[:3, :3] = rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64)).numpy()
+    T[:3, :3] = rotation_from_zyx(torch.tensor(rpy, dtype=torch.float64)).numpy()
     T[:3, 3] = [0, 0, distance] - T[:3, :3] @ BOARD.corners.mean(0)
     return T
 

@@ -19,7 +19,7 @@ from pisigma.model.calibrated_model import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, rotation_vector, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_vector, transform_from_xyz_zyx
 from pisigma.validation.held_out.model_comparison import compare_models, inside_domain
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
 from pisigma.validation.resampling import Bootstrap
@@ -111,7 +111,7 @@ def test_the_nominal_model_is_the_nominal_arm_with_base_and_tool_that_suit_it():
 def test_nominal_of_several_frames_and_targets():
     true, robot = simulate("kiro4", rows=1).true, Robot.load("kiro4")
     q = joints_in(true, 90, seed=1)
-    T_wall, T_ball = transform_from_xyzrpy(
+    T_wall, T_ball = transform_from_xyz_zyx(
         torch.tensor([[0.5, -0.3, 0.2, 0.4, -0.2, 1.0], [0.05, 0.1, -0.04, 0, 0, 0]]).double()
     )
     number = torch.arange(90)

@@ -12,12 +12,12 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.checks.row_order import instrument_moved_error
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
-ELSEWHERE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.1, -0.2], dtype=torch.float64))
+ELSEWHERE = transform_from_xyz_zyx(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.1, -0.2], dtype=torch.float64))
 ROWS = 60
 
 

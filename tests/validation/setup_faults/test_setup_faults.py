@@ -13,7 +13,7 @@ from testing.models import no_type_checker
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.held_out.reference_models import nominal_model
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults
@@ -21,8 +21,8 @@ from pisigma.validation.setup_faults.setup_faults import find_setup_faults
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 ROWS = 50
-FRAME = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
-TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
+FRAME = transform_from_xyz_zyx(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
+TOOL = transform_from_xyz_zyx(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyz_zyx, xyz_zyx_from_transform
 from pisigma.validation.held_out.arms_summary import ArmsSummary
 from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE, Arm, arms_of_cell, calibrate_arms
 from pisigma.workflow.arms.find_moved_arms import find_moved_arms
@@ -46,7 +46,7 @@ def folder(tmp_path_factory, nominal) -> Path:
 
 def now(nominal: tuple[Robot, Robot], motion: torch.Tensor, zero: float = 0.0) -> dict[str, Measurements]:
     """Return new rows of both arms in the frame, after a motion of the base and a new zero of the waist."""
-    base = xyzrpy_from_transform(motion @ transform_from_xyzrpy(torch.from_numpy(IN_HALL))).numpy()
+    base = xyz_zyx_from_transform(motion @ transform_from_xyz_zyx(torch.from_numpy(IN_HALL))).numpy()
     return {
         name: measured_rows(true_arm(nominal, k, 0, JOINTS, zero).with_geometry(base=base), 100 + k, 10)
         for k, name in enumerate(ARMS)

@@ -20,10 +20,10 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import (
     nearest_rotation,
-    rotation_from_rpy,
     rotation_from_vector,
-    rpy_from_rotation,
+    rotation_from_zyx,
     skew,
+    zyx_from_rotation,
 )
 
 _GUESS_STEPS = 2
@@ -143,14 +143,14 @@ def _base_and_tools(
     robot: Robot, problem: BaseToolProblem, state: BaseToolState
 ) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
     """Return the base and every target's tool; the tool keeps its orientation if no rotation was measured."""
-    rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
+    zyx_base, zyx_tool = zyx_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
     if not problem.has_rotations:
-        rpy_tool = robot.tool[3:]
+        zyx_tool = robot.tool[3:]
     tools = {
-        name: np.concatenate([point.cpu().numpy(), rpy_tool])
+        name: np.concatenate([point.cpu().numpy(), zyx_tool])
         for name, point in zip(problem.targets, state.points, strict=True)
     }
-    return np.concatenate([state.p_base.cpu().numpy(), rpy_base]), tools
+    return np.concatenate([state.p_base.cpu().numpy(), zyx_base]), tools
 
 
 def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> Solution[BaseToolState]:
@@ -220,7 +220,7 @@ def fit_base_to_touches(
     Returns:
         The base, and the RMS residual of the touches [m].
     """
-    starts = [(rotation_from_rpy(guess[3:]), guess[:3])]
+    starts = [(rotation_from_zyx(guess[3:]), guess[:3])]
     linear = _linear_rotation(tip, axis, touch)
     if linear is not None:
         starts.insert(0, (linear, torch.zeros(3).to(tip)))
@@ -228,7 +228,7 @@ def fit_base_to_touches(
     for R, p in starts:
         R, p, rms = _refined(tip, axis, touch, R, p)
         if rms < miss:
-            best, miss = torch.cat([p, rpy_from_rotation(R)]), rms
+            best, miss = torch.cat([p, zyx_from_rotation(R)]), rms
     return best, miss
 
 

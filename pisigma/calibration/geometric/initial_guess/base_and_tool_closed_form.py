@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool_problem import BaseToolProblem, BaseToolState
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import nearest_rotation, rotation_from_rpy
+from pisigma.robot.se3 import nearest_rotation, rotation_from_zyx
 
 MAX_ITERATIONS = 60
 _LINEAR_ROWS = 13
@@ -30,7 +30,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
         problem: flange poses and measurements.
     """
     like = problem.position
-    R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
+    R_tool, R_base = (rotation_from_zyx(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
     point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
     # Rows with a rotation determine both frames; positions of several targets share only a base, so one target is used.
     rows = problem.has_rotation if problem.has_rotations else problem.target == problem.target.mode().values

@@ -28,8 +28,8 @@ from pisigma.measurement.sensors.socket import group_means
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
-    rpy_from_rotation,
-    transform_from_xyzrpy,
+    transform_from_xyz_zyx,
+    zyx_from_rotation,
 )
 
 _GUESS_ROWS = 1_024
@@ -109,14 +109,14 @@ def guess(
     if poses_alone:
         return InitialGuess(np.stack([bases[name] for name in space.frames]), all_tools, {}, {})
     target = indices_of_names(measurements.target, space.targets, measurements.rows)
-    T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
+    T_tool = T_flange @ transform_from_xyz_zyx(torch.from_numpy(all_tools))[target]
     for name, rows in touched.items():
         bases[name] = _from_touches(space, measurements, name, rows, T_tool[:, :3, 3])
     for name in wired:
         bases[name] = base_from_anchors(measurements, name, T_tool[:, :3, 3], bases[name])
     all_bases = np.stack([bases[name] for name in space.frames])
     frame = indices_of_names(measurements.frame, space.frames, measurements.rows)
-    T = transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool
+    T = transform_from_xyz_zyx(torch.from_numpy(all_bases))[frame] @ T_tool
     unknowns, free = {}, {}
     for sensor in SENSORS.values():
         group, own = sensor.unknowns(measurements), sensor.initial_guess(measurements, T, space.robot.reach)
@@ -177,7 +177,7 @@ def _base_by_tools(
     tool = torch.from_numpy(np.stack([tools[name][:3] for name in measurements.target]))
     points = (T[:, :3, :3] @ tool[..., None])[..., 0] + T[:, :3, 3]
     R_base, place = fit_base_to_points(points, measurements.position.cpu())
-    return torch.cat([place, rpy_from_rotation(R_base)]).numpy()
+    return torch.cat([place, zyx_from_rotation(R_base)]).numpy()
 
 
 def randomly_chosen_rows(rows: int, max_rows: int) -> Int64[Tensor, " chosen"]:

@@ -22,7 +22,7 @@ from pisigma.measurement.sensors.distance import (
 from pisigma.measurement.sensors.sensor import distinct_names, indices_of_names
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import RobotClass
-from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
+from pisigma.robot.se3 import rotation_from_zyx, zyx_from_rotation
 
 MAX_ITERATIONS = 60
 _CONVERGENCE_TOLERANCE = 1e-6
@@ -241,9 +241,9 @@ def base_from_anchors(
     if not seen:
         return nominal_base
     R, p = fit_base_to_points(
-        torch.stack(seen), torch.stack(stated), rotation_from_rpy(tip.new_tensor(nominal_base[3:]))
+        torch.stack(seen), torch.stack(stated), rotation_from_zyx(tip.new_tensor(nominal_base[3:]))
     )
-    return torch.cat([p, rpy_from_rotation(R)]).numpy()
+    return torch.cat([p, zyx_from_rotation(R)]).numpy()
 
 
 def _refuse_other_units(

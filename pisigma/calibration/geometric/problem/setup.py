@@ -26,7 +26,7 @@ from pisigma.measurement.sensors.registry import build_sensors, sort_pairs_first
 from pisigma.measurement.sensors.sensor import SensorRows, indices_of_names
 from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSensor
 from pisigma.robot.description import Robot
-from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_zyx, transform_from_xyz_zyx, zyx_from_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,10 +254,10 @@ def _anchored(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
     )
     if options.free_base:
-        reference = ReferenceFrames(transform_from_xyzrpy(torch.from_numpy(bases)), reference.tools)
+        reference = ReferenceFrames(transform_from_xyz_zyx(torch.from_numpy(bases)), reference.tools)
         bases = np.zeros_like(bases)
     if options.free_tool:
-        reference = ReferenceFrames(reference.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
+        reference = ReferenceFrames(reference.bases, rotation_from_zyx(torch.from_numpy(tools[:, 3:])))
         tools[:, 3:] = 0
     unknowns = {
         own.name: _moved(
@@ -340,9 +340,9 @@ def in_user_coordinates(
     dh, bases, tools = (block.clone() for block in setup.problem.space.split(point.cpu()))
     T_anchor, R_tool = setup.reference_frames.bases.cpu(), setup.reference_frames.tools.cpu()
     R_anchor = T_anchor[:, :3, :3]
-    bases[:, 3:] = rpy_from_rotation(R_anchor @ rotation_from_rpy(bases[:, 3:]))
+    bases[:, 3:] = zyx_from_rotation(R_anchor @ rotation_from_zyx(bases[:, 3:]))
     bases[:, :3] = (R_anchor @ bases[:, :3, None])[..., 0] + T_anchor[:, :3, 3]
-    tools[:, 3:] = rpy_from_rotation(rotation_from_rpy(tools[:, 3:]) @ R_tool)
+    tools[:, 3:] = zyx_from_rotation(rotation_from_zyx(tools[:, 3:]) @ R_tool)
     return dh.numpy(), bases.numpy(), tools.numpy()
 
 
@@ -365,13 +365,13 @@ def coordinate_change(
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
         # At a pitch of 90 deg, roll and yaw have the same axis; the pseudo-inverse then returns the smallest changes.
-        back = torch.linalg.pinv(rpy_axes(user_bases[k, 3:]), rtol=1e-9)
+        back = torch.linalg.pinv(zyx_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
-        change[turns, turns] = back @ anchor[:3, :3] @ rpy_axes(bases[k, 3:])
+        change[turns, turns] = back @ anchor[:3, :3] @ zyx_axes(bases[k, 3:])
     for k in range(len(tools)):
         first = space.indices_of("tool").start + 6 * k + 3
-        back = torch.linalg.pinv(rpy_axes(user_tools[k, 3:]), rtol=1e-9)
-        change[first : first + 3, first : first + 3] = back @ rpy_axes(tools[k, 3:])
+        back = torch.linalg.pinv(zyx_axes(user_tools[k, 3:]), rtol=1e-9)
+        change[first : first + 3, first : first + 3] = back @ zyx_axes(tools[k, 3:])
     for own in space.unknowns:
         # Shifts of points are also in the axes of their frame's anchor.
         if own.has_point:
@@ -393,8 +393,8 @@ def unknowns_in_frames(
     }
 
 
-def rpy_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
+def zyx_axes(zyx: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
     """Return the rotation axes of roll, pitch and yaw as columns, for `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
-    roll, pitch, _ = rpy.tolist()
+    roll, pitch, _ = zyx.tolist()
     (cr, cp), (sr, sp) = ((turn(roll), turn(pitch)) for turn in (math.cos, math.sin))
-    return rpy.new_tensor([[0.0, -sr, cr * cp], [0.0, cr, sr * cp], [1.0, 0.0, -sp]])
+    return zyx.new_tensor([[0.0, -sr, cr * cp], [0.0, cr, sr * cp], [1.0, 0.0, -sp]])

@@ -13,7 +13,7 @@ from pisigma.files.errors import RobotError
 from pisigma.robot.chains import joint_origins, robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, translation, xyz_zyx_of
 
 JOINTS = 6
 SOURCE = "universal-robots.com, DH parameters for calculations of kinematics and dynamics"
@@ -98,7 +98,7 @@ class ControllerGeometry:
             before = screw
         base = frame_of(calibrated.base) @ T_rows_base
         tool = inverse(before) @ end @ frame_of(calibrated.tool)
-        return moved, self.robot.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
+        return moved, self.robot.with_geometry(base=xyz_zyx_of(base), tool=xyz_zyx_of(tool))
 
     def _screws(self, T_rows_base: Frame) -> list[Frame]:
         """Return every joint's shift along and about its axis from the description's frame to the controller's."""
@@ -112,7 +112,7 @@ class ControllerGeometry:
 
     def frames(self) -> Frames:
         """Return the differences between the description's frames and the controller's."""
-        base, tool = xyzrpy_of(self.T_poses_base), xyzrpy_of(self.T_flange_tool)
+        base, tool = xyz_zyx_of(self.T_poses_base), xyz_zyx_of(self.T_flange_tool)
         return Frames(self._sentence(), base, tool)
 
     def _sentence(self) -> str:
@@ -137,7 +137,7 @@ def _screw(T: Frame) -> Frame:
 
 def _frame_words(T: Frame) -> str:
     """Format a frame as text; "" for the identity."""
-    x, y, z, *angles = xyzrpy_of(T)
+    x, y, z, *angles = xyz_zyx_of(T)
     lengths = [f"{name} {value * 1e3:.6g} mm" for name, value in zip("xyz", (x, y, z), strict=True) if value]
     names = ("roll", "pitch", "yaw")
     turns = [f"{name} {np.rad2deg(a):.6g} deg" for name, a in zip(names, angles, strict=True) if a]
@@ -241,7 +241,7 @@ def _placed(model: str, own: Robot, described_robot: Robot) -> tuple[float, Cont
     T = forward_kinematics(described_robot, q)
 
     def described_with(base: Frame, tool: Frame) -> tuple[float, Robot]:
-        robot = own.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
+        robot = own.with_geometry(base=xyz_zyx_of(base), tool=xyz_zyx_of(tool))
         return float((forward_kinematics(robot, q) - T)[:, :3, 3].norm(dim=-1).mean()), robot
 
     distance, robot = described_with(base, tool)
@@ -281,20 +281,20 @@ def _zero_frames(robot: Robot) -> list[Frame]:
 
 def _clean(T: Frame) -> Frame:
     """Remove rounding errors from a frame: right angles to 1e-9 rad, zeros to 1e-12 m."""
-    return frame_of(_rounded(xyzrpy_of(T), 1e-9, 1e-12))
+    return frame_of(_rounded(xyz_zyx_of(T), 1e-9, 1e-12))
 
 
 def _right(T: Frame) -> Frame:
     """Return the frame before calibration if it had right angles at the origin, otherwise the given frame."""
-    values = xyzrpy_of(T)
+    values = xyz_zyx_of(T)
     rounded = _rounded(values, _NEAR_ANGLE, _NEAR_LENGTH)
     quarters = rounded[3:] / (np.pi / 2)
     whole = not rounded[:3].any() and bool((quarters == np.rint(quarters)).all())
     return frame_of(rounded if whole else values)
 
 
-def _rounded(xyzrpy: Float64[np.ndarray, " 6"], angle: float, length: float) -> Float64[np.ndarray, " 6"]:
-    lengths, angles = xyzrpy[:3], xyzrpy[3:]
+def _rounded(xyz_zyx: Float64[np.ndarray, " 6"], angle: float, length: float) -> Float64[np.ndarray, " 6"]:
+    lengths, angles = xyz_zyx[:3], xyz_zyx[3:]
     quarters = np.rint(angles / (np.pi / 2)) * (np.pi / 2)
     return np.concatenate(
         [

@@ -24,7 +24,7 @@ from pisigma.files.yaml_writing import yaml_text
 from pisigma.robot.chains import robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.row import BoundedFloat
-from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyz_zyx_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 """Keys in the order of `frame_of`; the driver's roll is about x, that of pisigma about z."""
@@ -87,7 +87,7 @@ def write_kinematics(content: FileContent) -> str:
     """Return the kinematics YAML; the frame after the last joint is part of the tool in the comments."""
     origins, own = controller_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
-        link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
+        link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyz_zyx_of(origin), strict=True)}
         for link, origin in zip(_LINKS, origins, strict=True)
     }
     links["hash"] = calibration_hash(without_beta(origins, own))

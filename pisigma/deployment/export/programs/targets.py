@@ -13,7 +13,7 @@ from pisigma.model.inverse.solution import Solution
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 
 WITH_TARGET = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 """Statuses of poses that have a target."""
@@ -61,12 +61,12 @@ class Targets:
     @property
     def T_root_poses(self) -> Float64[Tensor, "4 4"]:
         """Pose of the frame of T relative to the origin of the robot description."""
-        return invert(transform_from_xyzrpy(torch.from_numpy(self.robot.base.copy())))
+        return invert(transform_from_xyz_zyx(torch.from_numpy(self.robot.base.copy())))
 
     @property
     def T_flange_tool(self) -> Float64[Tensor, "4 4"]:
         """Pose of the tool of T relative to the last row of the robot description."""
-        return transform_from_xyzrpy(torch.from_numpy(self.robot.tool.copy()))
+        return transform_from_xyz_zyx(torch.from_numpy(self.robot.tool.copy()))
 
     def lines_with_status(self, *statuses: Status) -> tuple[int, ...]:
         """Return the lines of the poses with the given statuses."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.robot.se3 import rotation_vector, rpy_from_rotation
+from pisigma.robot.se3 import rotation_vector, zyx_from_rotation
 
 DIGITS = 6
 """Number of decimals of degrees and millimetres, which rounds joints by 1e-8 rad and moves no tool by a micrometre.
@@ -71,7 +71,7 @@ def millimetres_and_euler(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "
     `RotZ(-a) R = RotY(b) RotX(c)`, whose second row is `0, cos c, -sin c`.
     """
     R = T[..., :3, :3]
-    a, b, _ = rpy_from_rotation(R).unbind(-1)
+    a, b, _ = zyx_from_rotation(R).unbind(-1)
     row = torch.cos(a)[..., None] * R[..., 1, :] - torch.sin(a)[..., None] * R[..., 0, :]
     angles = torch.stack([a, b, torch.atan2(-row[..., 2], row[..., 1])], -1)
     return torch.cat([T[..., :3, 3] * 1e3, torch.rad2deg(angles)], -1)

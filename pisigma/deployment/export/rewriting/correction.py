@@ -15,7 +15,7 @@ from pisigma.deployment.export.rewriting.scan import Edit, Frame, PathMove, Pose
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyz_zyx
 
 _SPACING = 0.01
 """Largest distance between points at which a path is evaluated [m]."""
@@ -142,7 +142,7 @@ class ProgramCorrection:
         """Compute the poses to command for poses of each target's tool in the target's frame."""
         robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
         base, tool = (
-            transform_from_xyzrpy(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
+            transform_from_xyz_zyx(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
         )
         before = base @ torch.stack([target.T_root_frame for target in targets])
         after = invert(torch.stack([target.T_flange_tool for target in targets])) @ tool

@@ -24,7 +24,7 @@ from pisigma.deployment.export.rewriting.scan import (
     external_axes,
     waypoint_groups,
 )
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 _LINE = re.compile(r"(?m)^(?P<head>[ \t]*\d+:)(?P<body>(?:[^;\r\n]|\r?\n[ \t]*:)*)(?P<end>;[^\n]*\n)")
 _MOVE = re.compile(r"[ \t]*(?P<kind>[JLCA])[ \t]+(?P<target>(?:P|PR)\[[^\]]*\])(?P<rest>[\s\S]*)")
@@ -145,7 +145,7 @@ class _Reader:
             return f"{used} (P[{name}], line {self.scan.line_number(match.start())})"
         six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])
-        T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))
+        T = transform_from_xyz_zyx(torch.stack([x, y, z, r, p, w]))
         return Pose(values.span("six"), T, partial(_written, values["six"]))
 
     def _waypoints(

@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.files.errors import OutputError
 from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.robot.robot_file import FrameSection
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 
 class FrameFile(Section):
@@ -51,4 +51,4 @@ def _lookup(sections: dict[str, FrameSection], name: str, kind: str) -> Float64[
     section = next((value for key, value in sections.items() if key.upper() == name.upper()), None)
     if section is None:
         return f"the {kind} '{name}' is not stated; state it in --frames"
-    return transform_from_xyzrpy(torch.from_numpy(section.to_si()))
+    return transform_from_xyz_zyx(torch.from_numpy(section.to_si()))

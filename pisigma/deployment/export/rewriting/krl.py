@@ -28,7 +28,7 @@ from pisigma.deployment.export.rewriting.scan import (
     numbers_in,
     waypoint_groups,
 )
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 
 _HIDDEN = re.compile(r';[^\n]*|"[^"\n]*"')
 _SIX = r"\s*,\s*".join(rf"{letter}\s*{NUMBER}" for letter in "XYZABC")
@@ -251,8 +251,8 @@ def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | st
 
 def _pose(literal: re.Match[str]) -> Pose:
     values = torch.tensor(numbers_in(re.sub(r"[A-Ca-cX-Zx-z]", " ", literal[1])), dtype=torch.float64)
-    xyzrpy = torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])])
-    return Pose(literal.span(1), transform_from_xyzrpy(xyzrpy), _six)
+    xyz_zyx = torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])])
+    return Pose(literal.span(1), transform_from_xyz_zyx(xyz_zyx), _six)
 
 
 def _six(T: Frame) -> str:

@@ -18,7 +18,7 @@ from pisigma.robot.kinematics.components import (
     Frame,
     as_transform,
     compose_row,
-    compose_xyzrpy,
+    compose_xyz_zyx,
     cosine_sine,
     rotate_x,
 )
@@ -90,10 +90,10 @@ def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[fl
     like = torch.zeros((), dtype=torch.float64)
     return CanonicalRows(
         T_base_first=as_transform(
-            _follow_fixed(robot, compose_xyzrpy(IDENTITY, robot.base.tolist()), 0, first), like
+            _follow_fixed(robot, compose_xyz_zyx(IDENTITY, robot.base.tolist()), 0, first), like
         ),
         T_last_tool=as_transform(
-            compose_xyzrpy(_follow_fixed(robot, frame, last + 1, len(robot.rows)), robot.tool.tolist()), like
+            compose_xyz_zyx(_follow_fixed(robot, frame, last + 1, len(robot.rows)), robot.tool.tolist()), like
         ),
         sign=torch.tensor(signs, dtype=torch.float64),
         direction=torch.from_numpy(robot.directions),

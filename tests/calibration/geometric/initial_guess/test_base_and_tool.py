@@ -21,9 +21,9 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
     invert,
     nearest_rotation,
-    rotation_from_rpy,
     rotation_from_vector,
-    transform_from_xyzrpy,
+    rotation_from_zyx,
+    transform_from_xyz_zyx,
 )
 
 
@@ -69,8 +69,8 @@ def test_no_orientation_is_special() -> None:
         arm = simulate("ur5", rows=30, length=0, angle=0, base=base)
         fit = fit_base_and_tool(arm.nominal, arm.measurements)
         assert_close(
-            transform_from_xyzrpy(torch.tensor(fit.robot.base)),
-            transform_from_xyzrpy(torch.from_numpy(base)),
+            transform_from_xyz_zyx(torch.tensor(fit.robot.base)),
+            transform_from_xyz_zyx(torch.from_numpy(base)),
             atol=1e-10,
         )
 
@@ -86,7 +86,7 @@ def test_several_targets_have_their_own_points() -> None:
     target = tuple("ABC"[row % 3] for row in range(60))
     tools = torch.tensor([[*points[name], 0.0, 0.0, 0.0] for name in target], dtype=torch.float64)
     still = arm.true.with_geometry(tool=np.zeros(6))
-    T = forward_kinematics(still, arm.measurements.q) @ transform_from_xyzrpy(tools)
+    T = forward_kinematics(still, arm.measurements.q) @ transform_from_xyz_zyx(tools)
     fit = fit_base_and_tool(
         arm.nominal, Measurements(q=arm.measurements.q, position=T[:, :3, 3].contiguous(), target=target)
     )
@@ -120,9 +120,9 @@ def test_a_fixed_base_or_tool_remains_unchanged(poses: bool) -> None:
 
 
 def test_the_closed_form_of_poses_is_exact_without_polish(generator: torch.Generator) -> None:
-    X, Y = (rotation_from_rpy(torch.randn(3, generator=generator, dtype=torch.float64)) for _ in range(2))
+    X, Y = (rotation_from_zyx(torch.randn(3, generator=generator, dtype=torch.float64)) for _ in range(2))
     x, y = (torch.randn(3, generator=generator, dtype=torch.float64) for _ in range(2))
-    R = rotation_from_rpy(torch.randn(8, 3, generator=generator, dtype=torch.float64))
+    R = rotation_from_zyx(torch.randn(8, 3, generator=generator, dtype=torch.float64))
     p = torch.randn(8, 3, generator=generator, dtype=torch.float64)
     position = (p + R @ y) @ X.mT + x
     nominal = torch.zeros(3, dtype=torch.float64)
@@ -165,8 +165,8 @@ def test_joint_values_of_another_robot_are_refused() -> None:
 def in_second_frame(few: int, seed: int) -> tuple[Measurements, Measurements]:
     """60 positions in the frame F and a few in G; and 100 exact ones in G at other joint values."""
     arm = simulate("ur10", seed, rows=160 + few, noise=5e-5)
-    base = transform_from_xyzrpy(torch.tensor([1.0, -0.2, 0.5, 0.3, -0.4, 0.6], dtype=torch.float64))
-    T = base @ invert(transform_from_xyzrpy(torch.from_numpy(BASE)))
+    base = transform_from_xyz_zyx(torch.tensor([1.0, -0.2, 0.5, 0.3, -0.4, 0.6], dtype=torch.float64))
+    T = base @ invert(transform_from_xyz_zyx(torch.from_numpy(BASE)))
     q, position = arm.measurements.q, arm.measurements.position.clone()
     position[60:] = position[60:] @ T[:3, :3].mT + T[:3, 3]
     position[-100:] = (T @ forward_kinematics(arm.true, q[-100:]))[:, :3, 3]

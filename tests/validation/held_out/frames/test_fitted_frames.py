@@ -13,7 +13,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.model.calibrated_model import poses_of_rows
-from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.validation.held_out.frames.fitted_frames import (
     MIN_CONFIGURATIONS,
     errors_in_fitted_frames,
@@ -21,8 +21,8 @@ from pisigma.validation.held_out.frames.fitted_frames import (
 )
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
-BASE = transform_from_xyzrpy(torch.tensor([1.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
-TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
+BASE = transform_from_xyz_zyx(torch.tensor([1.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
+TOOL = transform_from_xyz_zyx(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
 EYE = torch.eye(4, dtype=torch.float64)
 
 
