@@ -17,18 +17,20 @@ from pisigma.robot.kinematics import tolerances
 
 
 @kernel
-def network_correction(description: Record, memory: Record, T: Array, q: Array) -> None:
+def write_network_correction(
+    description: Record, memory: Record, T_base_tool: Array, q_nominal: Array
+) -> None:
     """Write the correction of nominal joint values into `memory.delta` and scaled inputs into `memory.seen`.
 
     Args:
         description: the arm and its network.
         memory: working memory.
-        T: `(3 or 4, 4)`: T_base_tool.
-        q: nominal joint values [rad or m].
+        T_base_tool: pose of the tool `(3 or 4, 4)`.
+        q_nominal: nominal joint values [rad or m].
     """
     net, x = description.network, memory.seen
     for i in range(net.inputs):
-        x[i] = (_input(description, memory, T, q, i) - net.offset[i]) / net.scale[i]
+        x[i] = (_input(description, memory, T_base_tool, q_nominal, i) - net.offset[i]) / net.scale[i]
     for j in range(description.arms.dof):
         memory.delta[j] = 0.0
         group = net.group[j]
@@ -161,7 +163,7 @@ def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
     arms, q = description.arms, memory.q
     copy(memory.nominal, q)
     nearest_turn(arms, q, description.network.centre, False)  # shifted to the same turns as the training rows
-    network_correction(description, memory, memory.pose, q)
+    write_network_correction(description, memory, memory.pose, q)
     for j in range(arms.dof):
         q[j] = memory.nominal[j] + memory.delta[j]
     copy(q, memory.solution)
@@ -203,7 +205,7 @@ def _settle(description: Record, memory: Record, out: Array) -> None:
     copy(memory.nominal, q)
     for _ in range(tolerances.FORWARD_ITERATIONS):
         walk(arms, arrays.NOMINAL, q, memory.axes, memory.T)
-        network_correction(description, memory, memory.T, q)
+        write_network_correction(description, memory, memory.T, q)
         moved = 0.0
         for j in range(arms.dof):
             following = memory.solution[j] - memory.delta[j]
