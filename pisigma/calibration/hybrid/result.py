@@ -7,6 +7,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.outliers import Outlier
+from pisigma.calibration.geometric.parameter_table import ParameterEstimate
+from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.geometric.result import CalibrationResult
@@ -16,6 +18,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import measured_errors
+from pisigma.robot.se3 import wrap_to_pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,26 @@ class HybridResult:
     def outliers(self) -> tuple[Outlier, ...]:
         """Rows with less than half of the full weight in the resulting calibration, worst first."""
         return self.geometric.outliers if self.learned is None else self.learned.outliers
+
+    @property
+    def parameters(self) -> tuple[ParameterEstimate, ...]:
+        """All parameters of the geometric calibration, with standard errors that include its bias.
+
+        What only a correction describes, such as errors of gears, biases the geometric calibration. The standard error
+        is therefore at least the root mean square of its difference from the hybrid's posterior.
+        """
+        estimates, learned = self.geometric.parameters, self.learned
+        if learned is None:
+            return estimates
+        known = self.uncertainty
+        posterior = ParameterPosterior.from_geometry(known.space, learned.geometry, known.dense_root)
+        bias = torch.tensor([one.estimated for one in estimates], dtype=torch.float64) - posterior.mean
+        angle = torch.tensor([one.unit == "rad" for one in estimates])
+        errors = torch.where(angle, wrap_to_pi(bias), bias).hypot(posterior.standard_errors).tolist()
+        return tuple(
+            replace(one, standard_error=max(one.standard_error, error))  # NaN remains NaN
+            for one, error in zip(estimates, errors, strict=True)
+        )
 
     def arm(self) -> HybridArm | None:
         """Return the corrected arm with the first base and the first tool; None without a correction."""

@@ -13,7 +13,6 @@ from pydantic import Field, JsonValue
 
 from pisigma.calibration.geometric.identifiability.observability import Observability
 from pisigma.calibration.geometric.outliers import Outlier
-from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
 from pisigma.files.yaml_file import Section, StoredFigures
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
@@ -52,7 +51,7 @@ class ParameterFigures(Section):
         nominal: nominal value.
         estimated: estimated value.
         change: estimated minus nominal value.
-        standard_error: standard error of the estimate; None if it was not estimated.
+        standard_error: standard error of the estimate, see `HybridResult.parameters`; None if it was not estimated.
         remark: remark on the estimate as a sentence.
         label: the same in a few words.
     """
@@ -280,7 +279,7 @@ def summarise(result: Result) -> CalibrationSummary:
             )
             for one in geometric.noise
         ),
-        parameters=_parameters(geometric),
+        parameters=_parameters(result),
         redundancy=RedundancyFigures(
             kept=exact.kept,
             removed=exact.removed,
@@ -297,7 +296,7 @@ def summarise(result: Result) -> CalibrationSummary:
     return summary.with_figures(hybrid=_hybrid(result)) if isinstance(result, HybridResult) else summary
 
 
-def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
+def _parameters(result: Result) -> tuple[ParameterFigures, ...]:
     rows = []
     for parameter in result.parameters:
         unit, factor = SHOWN_UNITS[parameter.unit]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.fleet_robots import NOMINAL as FLEET_ROBOT
+from testing.fleet_robots import common_errors, rows_of
 from testing.linearised import random_joints, tracker_data
 from testing.models import no_type_checker
 from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
@@ -331,3 +333,14 @@ def test_a_single_joint_is_calibrated_without_products(rows: int, tmp_path: Path
         )
         held_out = tracker_data(held, test, 2e-4 * torch.sin(3 * test))
         assert rms(result, held_out) < 0.3 * rms(result.geometric, held_out)
+
+
+def test_standard_errors_include_the_bias_from_gears():
+    def ratio(result: HybridResult | CalibrationResult) -> float:
+        of_arm = zip(result.parameters, common_errors().flatten().tolist(), strict=False)
+        z = [(one.change - true) / one.standard_error for one, true in of_arm if one.label == "identified"]
+        return float(np.sqrt(np.mean(np.square(z))))
+
+    results = [HybridCalibrator(FLEET_ROBOT).fit(rows_of(k, 60, k, individual=0.0)) for k in (1, 3)]
+    assert min(ratio(result.geometric) for result in results) > 1.9
+    assert max(ratio(result) for result in results) < 1.2
