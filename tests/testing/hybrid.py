@@ -12,7 +12,9 @@ from testing.models import no_type_checker
 from testing.stored import stored
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid import calibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.gravity import USUAL
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement import splits
 from pisigma.measurement.dataset import Measurements
@@ -23,6 +25,7 @@ from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 from pisigma.validation.checks import other_robot
+from pisigma.validation.setup_faults import populations
 
 NOISE = 3e-5
 """Standard deviation of a measured coordinate [m]."""
@@ -30,7 +33,10 @@ NOISE = 3e-5
 
 @contextmanager
 def few_choices() -> Iterator[None]:
-    """Try few features and cross-validate once where neither harmonics nor repeats are stated, for other tests."""
+    """Try few features and cross-validate once where neither harmonics nor repeats are stated, for other tests.
+
+    Gravity acts down, as on all their robots, and the search for two populations of rows has few starts.
+    """
     whole, default = HybridCalibrator.__init__, HybridCalibrator.features
     few = {"features": ("gravity", "series"), "harmonics": (4, 8), "products": False}
 
@@ -42,6 +48,8 @@ def few_choices() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HybridCalibrator, "__init__", with_few)
         patch.setattr(splits, "_MAX_REPEATS", 1)
+        patch.setattr(calibrator, "gravity_by_evidence", lambda *arguments: USUAL)
+        patch.setattr(populations, "_STARTS", 3)
         yield
 
 
@@ -143,10 +151,10 @@ def _calibrated(
 ) -> HybridResult:
     true, measurements = _measured(name, rows, share, frames, payloads)
     with no_type_checker():
-        calibrator = HybridCalibrator(
+        chosen = HybridCalibrator(
             GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), products=products
         )
-        return calibrator.fit(measurements)
+        return chosen.fit(measurements)
 
 
 @functools.cache
