@@ -78,4 +78,4 @@ def test_frontal_views_are_warned_of(settings: PlanSettings):
     with no_type_checker():
         frontal = plan("ur5", replace(settings, count=5, check=0, candidates=20), cell)
     text = " ".join(frontal.warnings)
-    assert "frontal" in text
+    assert "tilted by less than 8 deg" in text
