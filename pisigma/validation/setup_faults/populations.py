@@ -203,7 +203,7 @@ class _Mixture:
         left = state.variance * r.size / max(r.size - state.used, 1.0) * _TAILS / (_TAILS - 2)
         every = _Em(self.rows.residual, self.rows.jacobian, self.Z, em.precision)
         return _Fit(
-            probability=every.probabilities(state.x, state.share, state.variance)[0],
+            probability=every.probabilities(every.squared_residuals(state.x), state.share, state.variance)[0],
             difference=difference,
             factor=(1 + made / left) ** 0.5,
             log_likelihood=(state.log_likelihood, one.log_likelihood),
@@ -272,7 +272,7 @@ class _Em:
         probability = np.stack([1 - state.probability, state.probability])
         variance = max(float((probability * state.weights * squares).sum()) / self.r.size, 1e-12)
         share = float(np.clip(state.probability.mean(), 1e-3, 1 - 1e-3))
-        fresh, log_likelihood = self.probabilities(x, share, variance)
+        fresh, log_likelihood = self.probabilities(squares, share, variance)
         # Expected weight of a row under the t distribution: outliers have less.
         weights = (_TAILS + values) / (_TAILS + squares / variance)
         return _State(fresh, weights, x, share, variance, used, log_likelihood)
@@ -284,11 +284,11 @@ class _Em:
         return np.stack([np.square(left).sum(1), np.square(left - self.Z @ x[common:]).sum(1)])
 
     def probabilities(
-        self, x: Float64[np.ndarray, " unknowns"], share: float, variance: float
+        self, squares: Float64[np.ndarray, "2 rows"], share: float, variance: float
     ) -> tuple[Float64[np.ndarray, " rows"], float]:
         """Compute the probability that a row belongs to the second population, and the log likelihood of all rows."""
         values = self.r.shape[1]
-        logs = -(_TAILS + values) / 2 * np.log1p(self.squared_residuals(x) / variance / _TAILS)
+        logs = -(_TAILS + values) / 2 * np.log1p(squares / variance / _TAILS)
         if not self.Z.shape[2]:
             return np.zeros(len(self.r)), float(logs[0].sum()) - self.r.size / 2 * math.log(variance)
         logs = logs + np.log([1 - share, share])[:, None]
