@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.prediction import predicted_poses
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -56,7 +56,7 @@ def fitted(
 ) -> RefinedFit:
     """Return the hybrid with the given features, with estimated or given prior scales."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
-    view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
+    view, design = contributions_and_noise_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)
     x[: design.active_count] = (solved.solution.linearisation.point - problem.prior_mean)[problem.active]
     noise, sizes = tuple(view.noise.tolist()), prior or design.prior(view.prior_scale.tolist())

@@ -27,8 +27,8 @@ from pisigma.robot.se3 import invert, transform_from_xyz_zyx, xyz_zyx_from_trans
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.camera.simulated_images import (
     RandomViews,
-    draw_board_poses,
     images_of,
+    noisy_board_poses,
     project_corners,
 )
 
@@ -50,7 +50,7 @@ def main(draws: int, count: int) -> None:
         rng = np.random.default_rng(draw)
         errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         true = nominal.with_geometry(nominal.dh + errors, base=base, tool=ON_FLANGE.numpy())
-        poses = draw_board_poses(true, q, NOISE.repeatability, torch.Generator().manual_seed(draw))
+        poses = noisy_board_poses(true, q, NOISE.repeatability, torch.Generator().manual_seed(draw))
         ideal, inside = project_corners(LENS, BOARD, poses)
         detected, exact = list[np.ndarray](), list[np.ndarray]()
         whole = list[int]()

@@ -22,7 +22,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds, with_fewer_training_rows
 from pisigma.robot import Robot
-from pisigma.validation.held_out.pose_statistics import PredictedSpread, predicted_spread
+from pisigma.validation.held_out.pose_statistics import ErrorsWithPredictedSigma, errors_with_predicted_sigma
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur5": "ur5/grid.csv", "ur10": "ur10/series_c_train.csv"}
@@ -46,7 +46,7 @@ class Judged:
 
     geometric: Tensor
     hybrid: Tensor
-    spread: PredictedSpread
+    spread: ErrorsWithPredictedSigma
 
 
 def folds(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
@@ -91,7 +91,7 @@ def judged(case: Case) -> Judged:
     geometric, hybrid = (
         model.errors_of(case.test)["position"].square().sum(1) for model in (result.geometric, result)
     )
-    one = Judged(geometric, hybrid, predicted_spread(result, case.test))
+    one = Judged(geometric, hybrid, errors_with_predicted_sigma(result, case.test))
     print_line(
         case.name, one, f"{seconds:5.1f} s  {[trial.name for trial in result.trials if trial.kept][-1]}"
     )
@@ -126,13 +126,13 @@ def main() -> None:
                 together = Judged(
                     torch.cat([one.geometric for one in cases]),
                     torch.cat([one.hybrid for one in cases]),
-                    PredictedSpread.concatenate([one.spread for one in cases]),
+                    ErrorsWithPredictedSigma.concatenate([one.spread for one in cases]),
                 )
                 if len(cases) > 1:
                     print_line(f"{group}, all", together, "")
                 ratios.append(float((together.hybrid.mean() / together.geometric.mean()).sqrt()))
                 spreads.append(together.spread)
-        coverage = PredictedSpread.concatenate(spreads).coverage
+        coverage = ErrorsWithPredictedSigma.concatenate(spreads).coverage
         mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
         print(
             f"{part}: geometric mean of the ratios {mean:.3f}, worst {max(ratios):.3f}, 95 %: {coverage:.1%}\n"

@@ -20,7 +20,7 @@ import torch
 from recalibration import simulated_arm, simulated_rows
 
 import pisigma
-from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session
+from pisigma.lifetime.monitoring.session import SessionResult, is_frame, judge_session
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
@@ -65,7 +65,7 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
     return replace(rows, q=q, position=rows.position @ T[:3, :3].T + T[:3, 3], rotation=rotation)
 
 
-def is_right(session: Session, joint: int) -> bool:
+def is_right(session: SessionResult, joint: int) -> bool:
     """Return whether exactly the moved joint is named, or no alarm is raised if no joint moved."""
     named = [one.what for one in session.movements if not is_frame(one.what)]
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"

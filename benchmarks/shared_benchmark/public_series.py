@@ -12,7 +12,7 @@ import torch
 
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.socket import matching_sockets
+from pisigma.measurement.sensors.socket import expand_socket_names
 from pisigma.robot import Robot
 from shared_benchmark.rows import Rows
 
@@ -107,7 +107,7 @@ class Series:
         if rows.socket is None:
             return {}
         here = set(rows.socket.tolist())
-        known = matching_sockets(self.distances, self.measurements.socket or ())
+        known = expand_socket_names(self.distances, self.measurements.socket or ())
         return {pair: length for pair, length in known.items() if here.issuperset(pair)}
 
 

@@ -128,7 +128,16 @@ def calibrate(
         chosen.check_unused(WITH_PRIOR)
         again = RecalibrationSettings(cameras=chosen.cameras)
         return recalibrate_into(
-            context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, nominal=nominal
+            context,
+            prior,
+            data,
+            again,
+            out,
+            accept_implausible,
+            overwrite,
+            as_json,
+            verbose,
+            fleet_robot=nominal,
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, chosen, progress)

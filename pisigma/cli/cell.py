@@ -235,7 +235,7 @@ def event(
     calibration, nor are those that were measured with other joint zeros of the controller.
     """
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.cell.exports import set_controller
+    from pisigma.workflow.cell.exports import record_active_export
 
     if (kind == "controller") is (export is None) or (export is not None and by):
         raise typer.BadParameter(
@@ -244,7 +244,7 @@ def event(
         )
     opened = Cell.open(cell)
     if export is not None:
-        changed = set_controller(opened, export, date, note)
+        changed = record_active_export(opened, export, date, note)
         record, line = {"day": changed.day, "kind": kind, "note": note}, f"controller on {changed.day}."
     else:
         recorded = opened.history.record(kind, date, note, by)

@@ -71,7 +71,7 @@ def plan(
         raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
     chosen = settings.build()
     planned_for, programs = PlanningSubject.load(subject, base, tip), program or []
-    workflow.check_files(out, programs, chosen, planned_for.robot, (subject, surroundings))
+    workflow.check_plan_outputs(out, programs, chosen, planned_for.robot, (subject, surroundings))
     with progress_of("plan") as progress:
         planned = workflow.plan(planned_for, chosen, surroundings, progress)
     planned.save(out, programs)

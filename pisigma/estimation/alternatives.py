@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import covariance_factor, orthonormal_columns
+from pisigma.estimation.cholesky import covariance_cholesky, orthonormal_columns
 from pisigma.estimation.drift import (
     NOISE_FACTORS,
     NOISE_SPREAD,
@@ -85,7 +85,7 @@ class FitResiduals:
         fitted_columns: Float64[Tensor, "values unknowns"],
         stated_covariance_root: Float64[Tensor, "values directions"],
         has_exact_noise: Bool[Tensor, " values"],
-        is_stated: bool,
+        has_stated_noise: bool,
         causes: Mapping[str, Float64[Tensor, "values _columns"]],
     ) -> "FitResiduals":
         """Return the residuals with the fitted unknowns projected out.
@@ -96,14 +96,14 @@ class FitResiduals:
             stated_covariance_root: root of the covariance of the residuals due to quantities known with a stated
                 uncertainty.
             has_exact_noise: values whose noise is exactly as stated.
-            is_stated: whether the noise of the other values is stated.
+            has_stated_noise: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
         """
         U = orthonormal_columns(fitted_columns)
         N = torch.linalg.qr(U, mode="complete")[0][:, U.shape[1] :].t()
         A = N @ stated_covariance_root
         columns = {name: compressed_columns(N @ Z) for name, Z in causes.items()}
-        return FitResiduals(N @ y, A @ A.t(), N[:, has_exact_noise], is_stated, columns)
+        return FitResiduals(N @ y, A @ A.t(), N[:, has_exact_noise], has_stated_noise, columns)
 
     def compare(self) -> tuple[Cause, ...]:
         """Return all causes: first those that are `named` because they are clear, then the others by Bayes factor."""
@@ -125,7 +125,7 @@ class FitResiduals:
         evidence = torch.empty(len(_NOISE), dtype=torch.float64)
         gains = {name: torch.empty(len(_NOISE), len(_SIZES), dtype=torch.float64) for name in self.causes}
         for row, factor in enumerate(_NOISE.tolist()):
-            L = covariance_factor(self._total(factor))
+            L = covariance_cholesky(self._total(factor))
             a = torch.linalg.solve_triangular(L, self.y[:, None], upper=False)[:, 0]
             evidence[row] = -0.5 * a.square().sum() - L.diagonal().log().sum()
             if self.is_stated:
@@ -308,7 +308,7 @@ class SessionEvidence:
 
     def error_score(self) -> float:
         """Return the RMS of the values divided by their standard deviations if nothing moved; usually about 1."""
-        factor = covariance_factor(self._K + self._noise(1.0).square().diag())
+        factor = covariance_cholesky(self._K + self._noise(1.0).square().diag())
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         return float(a.square().mean().sqrt())
 
@@ -323,7 +323,7 @@ class SessionEvidence:
         # One triangular solve per noise factor whitens values and all hypotheses at once.
         columns = torch.cat([self.values.y[:, None], *self._Z], 1)
         for row, noise_factor in enumerate(NOISE_FACTORS.tolist()):
-            factor = covariance_factor(K + self._noise(noise_factor).square().diag())
+            factor = covariance_cholesky(K + self._noise(noise_factor).square().diag())
             whitened = torch.linalg.solve_triangular(factor, columns, upper=False)
             evidence[row] = -0.5 * whitened[:, 0].square().sum() - factor.diagonal().log().sum()
             # Log-normal prior of the noise factor: few sessions have noise far from that of the calibration.
@@ -378,7 +378,7 @@ class SessionEvidence:
         for B in (self.values.X[:, one.index] * one.sigma for one in groups if one.fixed_size):
             V = V - B @ B.t()
         # Given the other variances, the estimate is a ridge regression with unit prior in units of `sigma`.
-        factor = covariance_factor(V)
+        factor = covariance_cholesky(V)
         index, deviation = (torch.cat([getattr(one, name) for one in groups]) for name in ("index", "sigma"))
         W = torch.linalg.solve_triangular(factor, self.values.X[:, index] * deviation, upper=False)
         normal = W.t() @ W

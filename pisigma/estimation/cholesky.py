@@ -44,7 +44,7 @@ def scaled_cholesky(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) 
         jitter *= 10
 
 
-def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
+def covariance_cholesky(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
     """Return the Cholesky factor of a covariance of values, with jitter if rounding makes it indefinite."""
     jitter = 0.0
     while True:
@@ -85,7 +85,7 @@ def row_blocks(count: int, size: int) -> list[slice]:
     return [slice(start, start + size) for start in range(0, count, size)]
 
 
-def return_free_memory(unknowns: int) -> None:
+def release_free_memory(unknowns: int) -> None:
     """Return free memory to the system after fits of many unknowns, if the C library can (`malloc_trim` of glibc).
 
     After a fit of thousands of unknowns, more than 100 MB of free memory is fragmented, and the matrices of the next

@@ -114,14 +114,14 @@ class CovarianceRoot:
     def with_columns(
         self,
         added: Float64[Tensor, "unknowns columns"],
-        scale: float,
+        sigma_factor: float,
         coordinate_change: Float64[Tensor, "parameters active"],
     ) -> "CovarianceRoot":
         """Return a root with more columns, scaled standard deviations, and the first unknowns in other coordinates.
 
         Args:
             added: columns to add.
-            scale: factor on the standard deviations.
+            sigma_factor: factor on the standard deviations.
             coordinate_change: matrix that converts the first unknowns to the other coordinates.
         """
         (parameters, active), (unknowns, columns) = coordinate_change.shape, self.directions.shape
@@ -129,9 +129,9 @@ class CovarianceRoot:
         for block, place in ((self.directions, slice(columns)), (added, slice(columns, None))):
             directions[:parameters, place] = coordinate_change @ block[:active].cpu()
             directions[parameters:, place] = block[active:]
-        directions.mul_(scale)
+        directions.mul_(sigma_factor)
         few = self.weights
-        return CovarianceRoot(directions, None if few is None else replace(few, size=few.size * scale))
+        return CovarianceRoot(directions, None if few is None else replace(few, size=few.size * sigma_factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def condition_on_equalities(
     B: Float64[Tensor, "equations directions"],
     G: Float64[Tensor, "equations unknowns"],
     r: Float64[Tensor, " equations"],
-    closure: Float64[Tensor, " equations"],
+    equation_sigma: Float64[Tensor, " equations"],
 ) -> ConditionedUnknowns:
     """Condition a standard normal z on `B z + G x + e = r`: least squares for x with the covariance of the equations.
 
@@ -171,10 +171,10 @@ def condition_on_equalities(
         B: derivatives of the equations with respect to z.
         G: derivatives with respect to x, of full column rank.
         r: misclosure of the equations at z = 0 and x = 0.
-        closure: standard deviation > 0 of e, with which the equations hold. It also keeps C positive definite if the
-            prior of the values on both sides is exact.
+        equation_sigma: standard deviation > 0 of e, with which the equations hold. It also keeps C positive definite if
+            the prior of the values on both sides is exact.
     """
-    E = closure.diag()
+    E = equation_sigma.diag()
     along = torch.cat([B, E], 1)
     # QR of the transposed root instead of the Cholesky factor of C, which has the square of its condition number.
     half = torch.linalg.qr(along.mT, mode="r").R

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import covariance_factor, scaled_cholesky
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.cholesky import covariance_cholesky, scaled_cholesky
+from pisigma.estimation.regression import SensorValueCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
 """Drift sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg and, for corrections, shares of ten times the usual
@@ -71,7 +71,7 @@ class LinearValues:
     y: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
     configuration: Int64[Tensor, " values"]
-    sensor_counts: tuple[SensorCount, ...]
+    sensor_counts: tuple[SensorValueCount, ...]
     wrong_configurations: Mapping[int, float] = field(default_factory=dict)
     rejected: frozenset[int] = frozenset()
 
@@ -213,7 +213,9 @@ class DriftSearch:
         V = self.covariance - group.size**2 * Z @ Z.t()
         if not reduced:
             Z = self.values.X[:, group.index] * group.scale
-        both = torch.linalg.solve_triangular(covariance_factor(V), torch.cat([y[:, None], Z], 1), upper=False)
+        both = torch.linalg.solve_triangular(
+            covariance_cholesky(V), torch.cat([y[:, None], Z], 1), upper=False
+        )
         return Z, both[:, 0], both[:, 1:]
 
     def _resize(self, number: int, size: float) -> None:
@@ -238,7 +240,7 @@ class DriftSearch:
         self._noise[sensor] = sigma
 
     def _log_evidence(self, V: Tensor) -> float:
-        factor = covariance_factor(V)
+        factor = covariance_cholesky(V)
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         estimated = [one for one in self._groups if one.size > 0 and not one.fixed_size]
         odds = self.values.log_prior_penalty + sum(one.log_prior_penalty for one in estimated)

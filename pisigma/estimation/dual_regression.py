@@ -9,9 +9,9 @@ from torch import Tensor
 
 from pisigma.estimation.cholesky import invert_from_factor, log_determinant, scaled_cholesky
 from pisigma.estimation.covariance_root import CovarianceRoot, ImplicitCovarianceRoot
-from pisigma.estimation.primal_regression import PrimalRegression, log_noise
+from pisigma.estimation.primal_regression import PrimalRegression, sum_log_noise_variance
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
+from pisigma.estimation.regression import AbstractRegression, Posterior, SensorValueCount
 
 DETERMINED = 1e-9
 """Share of the precision of a value, or of the best determined unknown, below which it is treated as undetermined."""
@@ -48,7 +48,7 @@ class DualRegression(AbstractRegression):
     prior: GaussianPrior
     active_count: int
     K: Float64[Tensor, "groups pairs"]
-    sensors: tuple[SensorCount, ...]
+    sensors: tuple[SensorValueCount, ...]
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """Compute the posterior for a prior and noise; see `AbstractRegression.solve`."""
@@ -71,8 +71,8 @@ class DualRegression(AbstractRegression):
         # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
-        # |V| contains the noise of all values; repeated poses are treated as fewer independent poses (`SensorCount`).
-        evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
+        # |V| contains the noise of all values; repeated poses count as fewer independent poses (`SensorValueCount`).
+        evidence += sum_log_noise_variance(self.sensors, noise) - float(variance.log().sum())
         # Residuals are variance · alpha; the leverage of a value is 1 - variance · P_ii.
         misfit = self._by_sensor((variance * alpha).square())
         used = self._by_sensor(1 - variance * P.diagonal())

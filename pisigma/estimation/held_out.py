@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.estimation.cholesky import orthonormal_columns
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.regression import SensorValueCount
 
 SINGULAR = 1e-6
 """Share of a held-out value's variance below which the other values do not determine it."""
@@ -36,7 +36,7 @@ class HeldOutErrors:
         M: Float64[Tensor, "values values"],
         residual: Float64[Tensor, " values"],
         sensor: Int64[Tensor, " values"],
-        sensor_counts: Sequence[SensorCount],
+        sensor_counts: Sequence[SensorValueCount],
     ) -> "HeldOutErrors":
         """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
@@ -74,7 +74,7 @@ class HeldOutErrors:
 
     def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:
         """Return the decrease of the squared errors relative to another fit, in standard errors."""
-        return standard_errors(
+        return sum_in_standard_errors(
             before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
         )
 
@@ -83,13 +83,13 @@ class HeldOutErrors:
         return (self.error * scale[self.sensor]).square()
 
 
-def standard_errors(values: Float64[Tensor, " values"]) -> float:
+def sum_in_standard_errors(values: Float64[Tensor, " values"]) -> float:
     """Return the sum of independent values divided by its standard error; 0 if all are equal."""
     scatter = (values.square().sum() - values.sum().square() / max(len(values), 1)).clamp(min=0).sqrt()
     return float(values.sum() / scatter) if float(scatter) > 0 else 0.0
 
 
-def held_out_scale(errors: HeldOutErrors) -> float:
+def held_out_covariance_factor(errors: HeldOutErrors) -> float:
     """Return the factor >= 1 on the covariance of the unknowns for which held-out errors are as large as predicted.
 
     With errors e and predicted standard deviations s in units of the noise, it solves

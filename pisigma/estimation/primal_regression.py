@@ -12,13 +12,13 @@ from pisigma.estimation.cholesky import (
     BLOCK,
     invert_triangle,
     log_determinant,
-    return_free_memory,
+    release_free_memory,
     row_blocks,
     scaled_cholesky,
 )
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
+from pisigma.estimation.regression import AbstractRegression, Posterior, SensorValueCount
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class PrimalRegression(AbstractRegression):
     normal: Float64[Tensor, "sensors unknowns unknowns"]
     descent: Float64[Tensor, "sensors unknowns"]
     squared_values: tuple[float, ...]
-    sensors: tuple[SensorCount, ...]
+    sensors: tuple[SensorValueCount, ...]
     latest_solution: list[SolvedRegression] = field(default_factory=list, init=False)
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
@@ -89,7 +89,7 @@ class PrimalRegression(AbstractRegression):
         log_prior = float(precision[precision > 0].log().sum())
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
         evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
-        evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
+        evidence = -0.5 * (evidence + sum_log_noise_variance(self.sensors, noise))
         square, determined = (
             prior.sum_by_group(x.square() * prior.unit_precision),
             prior.sum_by_group(1 - held),
@@ -117,7 +117,7 @@ class PrimalRegression(AbstractRegression):
             or self.latest_solution[0].prior is not prior
             or self.latest_solution[0].noise != noise
         ):
-            return_free_memory(len(prior.unit_precision))
+            release_free_memory(len(prior.unit_precision))
             # The matrix may take gigabytes, so the memory of the previous factor is reused.
             memory = (
                 self.latest_solution.pop().inverse.mT
@@ -144,7 +144,7 @@ class PrimalRegression(AbstractRegression):
         )
 
 
-def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
+def sum_log_noise_variance(sensors: Sequence[SensorValueCount], noise: Sequence[float]) -> float:
     """Return `Σ log noise²` over all values."""
     pairs = zip(sensors, noise, strict=True)
     return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)

@@ -49,7 +49,7 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class SensorCount:
+class SensorValueCount:
     """Number of values of a sensor, and properties of its noise.
 
     Attributes:
@@ -72,7 +72,7 @@ class AbstractRegression(ABC):
         sensors: number of values of every sensor.
     """
 
-    sensors: tuple[SensorCount, ...]
+    sensors: tuple[SensorValueCount, ...]
 
     @abstractmethod
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
@@ -125,7 +125,7 @@ class AbstractRegression(ABC):
         return posterior
 
 
-def prior_size_columns(
+def prior_scale_columns(
     posterior: Posterior, covariance_root: CovarianceRoot
 ) -> Float64[Tensor, "unknowns groups"]:
     """Return the columns that the uncertainty of the prior scales adds to a root of the covariance C of the unknowns.

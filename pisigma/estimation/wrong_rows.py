@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import covariance_factor
+from pisigma.estimation.cholesky import covariance_cholesky
 from pisigma.estimation.drift import LinearValues, evidence_gains
 
 _FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
@@ -75,7 +75,7 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
     vectors, see `DriftSearch`; in the metric of all values these are `V^-1` of the configuration.
     """
     values = explained.values
-    inverse = torch.cholesky_inverse(covariance_factor(explained.covariance))
+    inverse = torch.cholesky_inverse(covariance_cholesky(explained.covariance))
     a = inverse @ values.y
     tried: list[tuple[float, int, float]] = []
     for number in torch.unique(values.configuration).tolist():

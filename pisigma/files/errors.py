@@ -338,11 +338,11 @@ def check_choice(
             value=value,
             option=name,
             at=at,
-            remedy=nearest_choice(str(value), choices),
+            remedy=choice_remedy(str(value), choices),
         )
 
 
-def nearest_choice(given: str, choices: Iterable[str]) -> str:
+def choice_remedy(given: str, choices: Iterable[str]) -> str:
     """Return a remedy that lists the valid choices and suggests the one nearest to `given`.
 
     Returns:

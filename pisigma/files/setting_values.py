@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pisigma.files.errors import Place, SettingError, nearest_choice
+from pisigma.files.errors import Place, SettingError, choice_remedy
 from pisigma.files.setting import Setting
 
 _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
@@ -54,7 +54,7 @@ def checked_values(
 
     for key, value in values.items():
         if key not in settings:
-            problem, remedy = f"unknown key '{key}'", nearest_choice(key, settings)
+            problem, remedy = f"unknown key '{key}'", choice_remedy(key, settings)
             raise setting_error(key, key, f"one of {', '.join(settings)}", problem=problem, remedy=remedy)
         kind = settings[key].kind
         single = _listed(value, kind)

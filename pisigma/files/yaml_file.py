@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pisigma.files.errors import PisigmaError, Place, nearest_choice
+from pisigma.files.errors import PisigmaError, Place, choice_remedy
 from pisigma.files.input_file import read_text
 
 MAX_BYTES = 2**18
@@ -225,7 +225,7 @@ def _error_at(
     line, keys = _locate(node, path)
     context, value = finding.get("ctx", {}), finding["input"]
     if finding["type"] == "extra_forbidden":
-        hint = nearest_choice(str(keys[-1]), valid_keys(document, path[:-1]))
+        hint = choice_remedy(str(keys[-1]), valid_keys(document, path[:-1]))
         at = Place(source, line, _dotted(keys))
         return error(f"unknown key '{keys[-1]}'", value=keys[-1], at=at, remedy=hint)
     if finding["type"] == "missing":
@@ -245,7 +245,7 @@ def _error_at(
     if isinstance(cause := context.get("error"), PisigmaError):
         return cause.with_place(at, error)
     if finding["type"] in ("union_tag_invalid", "literal_error") and (texts := allowed_texts(document, path)):
-        return error(f"unknown value '{value}'", value=value, at=at, remedy=nearest_choice(str(value), texts))
+        return error(f"unknown value '{value}'", value=value, at=at, remedy=choice_remedy(str(value), texts))
     value = value if isinstance(value, str | int | float) else None
     message = finding["msg"].removeprefix("Value error, ").rstrip(".")
     if message.startswith("Input should be "):

@@ -15,10 +15,10 @@ from pisigma.robot.kernels.forms import CompiledForm
 
 
 @no_type_check
-def add_backlash(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_backlash(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the weight of every joint times its approach direction."""
     for j in range(arms.dof):
-        memory.delta[j] += correction.values[first + j] * memory.approach[j]
+        memory.delta[j] += correction.values[first_value_index + j] * memory.approach[j]
 
 
 class Backlash(AbstractFeature):

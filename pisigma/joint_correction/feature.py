@@ -197,7 +197,7 @@ def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor,
     return (q - q.new_tensor(middle)) / q.new_tensor(half)
 
 
-def unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+def product_unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
     """Compute the inputs of the product units: sines, then cosines of revolute joints, then scaled prismatic joints."""
     turning = torch.from_numpy(np.flatnonzero(robot.revolute)).to(q.device)
     sliding = torch.from_numpy(np.flatnonzero(~np.asarray(robot.revolute))).to(q.device)

@@ -65,7 +65,7 @@ class SeriesSection(FeatureSection):
 
 
 @no_type_check
-def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_series(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add sums of sines and cosines of multiples of every joint's angle, four joints at a time.
 
     `correction.values` contains the number of harmonics, and for each the weights of the sines and of the cosines of
@@ -75,7 +75,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
     `b_k = w_k + 2 cos(θ) b_k+1 - b_k+2`; the sum is `b_1 cos(θ) - b_2` of cosines and `b_1 sin(θ)` of sines.
     """
     values = correction.values
-    harmonics = int(values[first])
+    harmonics = int(values[first_value_index])
     for j in range(0, arms.dof, 4):
         sine, cosine = memory.turning[0, j : j + 4], memory.turning[1, j : j + 4]
         total = memory.delta[j : j + 4]
@@ -83,7 +83,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start = first + 1 + 2 * MAX_JOINTS * k + j
+            start = first_value_index + 1 + 2 * MAX_JOINTS * k + j
             a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
             # s and c are b_k+1 of the sines and of the cosines, u and v are b_k+2.
             u_0, s_0 = s_0, t_0 * s_0 + (a[0] - u_0)
@@ -101,10 +101,10 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
 
 
 @no_type_check
-def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_series_slope(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the derivative of every joint's series with respect to its joint value, with the same recurrence."""
     values = correction.values
-    harmonics = int(values[first])
+    harmonics = int(values[first_value_index])
     for j in range(0, arms.dof, 4):
         sine, cosine = memory.turning[0, j : j + 4], memory.turning[1, j : j + 4]
         total, rate = memory.slope[j : j + 4], correction.rate[j : j + 4]
@@ -112,7 +112,7 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start, times = first + 1 + 2 * MAX_JOINTS * k + j, k + 1.0
+            start, times = first_value_index + 1 + 2 * MAX_JOINTS * k + j, k + 1.0
             a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
             # The derivative of a sin(k θ) + b cos(k θ) is k a cos(k θ) - k b sin(k θ).
             u_0, s_0 = s_0, t_0 * s_0 - (times * b[0] + u_0)

@@ -31,10 +31,10 @@ class LinesSection(FeatureSection):
 
 
 @no_type_check
-def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_lines(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the lines; `correction.values` contains the number of lines, and joint, order and weights of each."""
-    for line in range(int(correction.values[first])):
-        start = first + 1 + 4 * line
+    for line in range(int(correction.values[first_value_index])):
+        start = first_value_index + 1 + 4 * line
         j, order = int(correction.values[start]), correction.values[start + 1]
         angle = order * correction.rate[j] * q[j]
         sine, cosine = correction.values[start + 2], correction.values[start + 3]
@@ -42,10 +42,10 @@ def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> No
 
 
 @no_type_check
-def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_lines_slope(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the derivative of the lines with respect to every joint's value."""
-    for line in range(int(correction.values[first])):
-        start = first + 1 + 4 * line
+    for line in range(int(correction.values[first_value_index])):
+        start = first_value_index + 1 + 4 * line
         j = int(correction.values[start])
         rate = correction.values[start + 1] * correction.rate[j]
         sine, cosine = correction.values[start + 2], correction.values[start + 3]

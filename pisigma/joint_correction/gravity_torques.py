@@ -29,7 +29,7 @@ class GravitySection(FeatureSection):
 
 
 @no_type_check
-def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_gravity(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the deflections of the joints by the gravity torques of unknown masses.
 
     Torque j is `Σ_k z_j · (arm_jk × g)`, with the weights of row k in `arm_jk`, and `z · (a × g) = a · (g × z)`.
@@ -37,7 +37,11 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
     the reach, and the weights of the first moments times `ARM`. `memory.frames` contains axis and origin of every
     joint, and axes and origin of its row.
     """
-    gx, gy, gz = correction.values[first], correction.values[first + 1], correction.values[first + 2]
+    gx, gy, gz = (
+        correction.values[first_value_index],
+        correction.values[first_value_index + 1],
+        correction.values[first_value_index + 2],
+    )
     dof = arms.dof
     for j in range(dof):
         own, sign = memory.frames[j], arms.direction[j]
@@ -46,7 +50,7 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
         force = 0.0
         # Joint j carries the bodies from its own row on.
         for k in range(j, dof):
-            start, frame = first + 3 + 4 * (dof * j + k), memory.frames[k]
+            start, frame = first_value_index + 3 + 4 * (dof * j + k), memory.frames[k]
             weight = correction.values[start : start + 4]
             force += weight[0]
             u += weight[0] * (frame[15] - own[3])

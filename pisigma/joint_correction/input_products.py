@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
+from pisigma.joint_correction.feature import AbstractFeature, product_unit_inputs
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
@@ -14,8 +14,8 @@ from pisigma.robot.description import Robot
 class InputProducts(AbstractFeature):
     """Products φ_a φ_b of two inputs of different joints, with one weight per product.
 
-    With φ = `unit_inputs`, product units of order 2 express the sum `Σ_ab w_ab φ_a φ_b`. After the weights are fitted,
-    the sum is converted to such units (see `factors`), which models contain.
+    With φ = `product_unit_inputs`, product units of order 2 express the sum `Σ_ab w_ab φ_a φ_b`. After the weights are
+    fitted, the sum is converted to such units (see `factors`), which models contain.
     """
 
     name = "products"
@@ -35,7 +35,7 @@ class InputProducts(AbstractFeature):
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return the products as columns, the same for every joint."""
-        phi = unit_inputs(self.robot, state.q)
+        phi = product_unit_inputs(self.robot, state.q)
         first, second = self.pairs.to(phi.device)
         values = phi.index_select(-1, first) * phi.index_select(-1, second)
         return values.unsqueeze(-2).expand(*values.shape[:-1], len(self.used), values.shape[-1])

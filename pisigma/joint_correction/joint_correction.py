@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
+from pisigma.joint_correction.feature import AbstractFeature, product_unit_inputs
 from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.network.pi_sigma import sum_of_products, weigh_sums
@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 class JointCorrection(nn.Module):
     """Correction Δ_j(q) [rad or m]: a unit of order 1 on features, and product units on sines and cosines.
 
-    For every joint j, with features f and φ = `unit_inputs` of all joints::
+    For every joint j, with features f and φ = `product_unit_inputs` of all joints::
 
         Δ_j(q) = Σ_f Σ_m w_jm f_jm(q) + Σ_u Π_{s in unit u} (b_js + Σ_i v_jsi φ_i(q))
 
@@ -52,7 +52,7 @@ class JointCorrection(nn.Module):
         zeros = [torch.zeros(feature.used.shape, dtype=torch.float64) for feature in features]
         self.linear = nn.ParameterList([nn.Parameter(values) for values in zeros])
         factors = sum(orders)
-        inputs = unit_inputs(robot, torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
+        inputs = product_unit_inputs(robot, torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
         self.weight = nn.Parameter(torch.zeros(robot.dof, factors, inputs, dtype=torch.float64))
         self.bias = nn.Parameter(torch.zeros(robot.dof, factors, dtype=torch.float64))
         self.register_buffer("fixed", torch.ones(robot.dof, factors, dtype=torch.float64))
@@ -100,5 +100,5 @@ class JointCorrection(nn.Module):
 
     def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
         """Compute the factors of the product units of all joints."""
-        phi = unit_inputs(self.robot, q)
+        phi = product_unit_inputs(self.robot, q)
         return weigh_sums(phi, self.weight.to(q), self.bias.to(q), self.fixed.to(q))

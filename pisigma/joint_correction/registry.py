@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pisigma.files.errors import ModelError, nearest_choice
+from pisigma.files.errors import ModelError, choice_remedy
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.coupled_series import CoupledSeries
@@ -42,7 +42,7 @@ def feature_by_name(name: str) -> type[AbstractFeature]:
         ModelError: the feature is unknown.
     """
     if name not in FEATURES:
-        hint = f"{nearest_choice(name, FEATURES)} Features of plug-ins need their plug-in (--plugin FILE)."
+        hint = f"{choice_remedy(name, FEATURES)} Features of plug-ins need their plug-in (--plugin FILE)."
         raise ModelError(f"there is no feature '{name}'", value=name, remedy=hint)
     return FEATURES[name]
 

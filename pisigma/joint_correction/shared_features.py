@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.joint_correction.feature import AbstractFeature, scaled_joints, unit_inputs
+from pisigma.joint_correction.feature import AbstractFeature, product_unit_inputs, scaled_joints
 from pisigma.joint_correction.onnx_chain import add_pose, add_roll_pitch_yaw
 from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
@@ -48,11 +48,11 @@ class AbstractSharedFeature(AbstractFeature):
 
 
 @no_type_check
-def add_scaled(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_scaled_joint_sum(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the weighted sum of the scaled joint values to every joint's correction."""
     for j in range(arms.dof):
         for i in range(arms.dof):
-            weight = correction.values[first + arms.dof * j + i]
+            weight = correction.values[first_value_index + arms.dof * j + i]
             memory.delta[j] += weight * (q[i] - correction.middle[i]) / correction.half[i]
 
 
@@ -60,7 +60,7 @@ class ScaledJoints(AbstractSharedFeature):
     """Scaled values of all joints: 0 in the middle of the limits, and ±1 at the limits."""
 
     name = "joints"
-    compiled = CompiledForm(add_scaled)
+    compiled = CompiledForm(add_scaled_joint_sum)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
         """Return the scaled joint values; see `scaled_joints`."""
@@ -76,26 +76,28 @@ class ScaledJoints(AbstractSharedFeature):
 
 
 @no_type_check
-def add_inputs(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+def add_product_input_sum(arms: Any, correction: Any, first_value_index: int, memory: Any, q: Any) -> None:
     """Add the weighted sum of the inputs of product units to every joint's correction."""
     for j in range(arms.dof):
         for i in range(correction.inputs):
-            memory.delta[j] += correction.values[first + correction.inputs * j + i] * memory.phi[i]
+            memory.delta[j] += (
+                correction.values[first_value_index + correction.inputs * j + i] * memory.phi[i]
+            )
 
 
 class SinesCosines(AbstractSharedFeature):
     """Sine and cosine of every revolute joint value, and scaled value of every prismatic joint."""
 
     name = "sin_cos"
-    compiled = CompiledForm(add_inputs)
+    compiled = CompiledForm(add_product_input_sum)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """Return the inputs of the product units; see `unit_inputs`."""
-        return unit_inputs(self.robot, q)
+        """Return the inputs of the product units; see `product_unit_inputs`."""
+        return product_unit_inputs(self.robot, q)
 
     def add_values(self, graph: OnnxGraph, q: str) -> str:
         """Add the columns to an ONNX graph; see `AbstractSharedFeature.add_values`."""
-        return add_unit_inputs(graph, self.robot, q)
+        return add_product_unit_inputs(graph, self.robot, q)
 
 
 class NominalPose(AbstractSharedFeature):
@@ -127,8 +129,8 @@ def add_scaled_joints(graph: OnnxGraph, robot: Robot, q: str) -> str:
     return graph.add_node("Add", graph.add_node("Mul", q, one - zero), zero)
 
 
-def add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """Add `unit_inputs` `(batch, inputs)` to an ONNX graph."""
+def add_product_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
+    """Add `product_unit_inputs` `(batch, inputs)` to an ONNX graph."""
     turning = np.flatnonzero(robot.revolute).tolist()
     sliding = np.flatnonzero(~np.array(robot.revolute)).tolist()
     angle = graph.columns(q, turning)

@@ -92,10 +92,10 @@ class RowValues:
 
     @staticmethod
     def stored_values(
-        numbers: Float64[Tensor, "rows numbers"], steps: Float64[Tensor, "rows 4"], robot: Robot
+        numbers: Float64[Tensor, "rows numbers"], rounding_steps: Float64[Tensor, "rows 4"], robot: Robot
     ) -> "RowValues":
         """Return values of rows of one file from stored numbers and steps."""
-        return RowValues(numbers, steps, _kinds(robot), torch.zeros(len(numbers), dtype=torch.int64))
+        return RowValues(numbers, rounding_steps, _kinds(robot), torch.zeros(len(numbers), dtype=torch.int64))
 
     def select(self, rows: Tensor) -> "RowValues":
         """Return the rows that an index selects."""

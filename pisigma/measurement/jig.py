@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, choice_remedy
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 
 Side = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
@@ -136,7 +136,7 @@ class Jig:
             option="jig",
             expected="a jig of the catalogue or a .yaml file",
             value=name,
-            remedy=nearest_choice(name, catalogue()),
+            remedy=choice_remedy(name, catalogue()),
         )
 
     @property

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, choice_remedy
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
@@ -84,7 +84,7 @@ def _check_shapes(data: MeasuredFields) -> None:
                 option="readings",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, numeric_columns()),
+                remedy=choice_remedy(name, numeric_columns()),
             )
         shape = (len(q), *(q.shape[1] if size < 0 else size for size in sizes[name]))
         if tuple(values.shape) != shape:
@@ -115,7 +115,7 @@ def _check_shapes(data: MeasuredFields) -> None:
                 option="readings",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, text_columns()),
+                remedy=choice_remedy(name, text_columns()),
             )
         if len(entries) != len(q):
             expected = f"{len(q)} entries, one per row"

@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, known_names
+from pisigma.model.calibrated_model import CalibratedModel, model_names_of_rows
 
 
 def position_accuracy(
@@ -69,8 +69,8 @@ def sigma_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
     """
     if model.uncertainty is None:
         return torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
-    frame = known_names(model.bases, measurements.frame, "frame", measurements)
-    target = known_names(model.tools, measurements.target, "target", measurements)
+    frame = model_names_of_rows(model.bases, measurements.frame, "frame", measurements)
+    target = model_names_of_rows(model.tools, measurements.target, "target", measurements)
     at, arm = replace(measurements, frame=frame, target=target), model.hybrid
     return model.uncertainty.sigma(at, None if arm is None else arm.correction)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, choice_remedy
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
@@ -251,7 +251,7 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
     return transform_from_xyz_zyx(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
 
 
-def known_names(
+def model_names_of_rows(
     frames_of_model: Frames, names: tuple[str, ...], name_kind: str, measurements: Measurements
 ) -> tuple[str, ...]:
     """Return the name that the model uses for the frame or target of every row.
@@ -292,7 +292,7 @@ def known_names(
                 f"the model was not calibrated for {name_kind} '{name}'",
                 value=name,
                 at=measurements.place_of(row, name_kind),
-                remedy=f"{hint}{nearest_choice(name, frames_of_model)}",
+                remedy=f"{hint}{choice_remedy(name, frames_of_model)}",
             )
     return names
 
@@ -318,7 +318,7 @@ def _of_rows(
     known: Frames, names: tuple[str, ...], name_kind: str, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"] | None:
     """Return the base or tool of every row; None if the model has only one, which the robot already contains."""
-    names = known_names(known, names, name_kind, measurements)
+    names = model_names_of_rows(known, names, name_kind, measurements)
     if len(known) < 2:
         return None
     order = list(known)

@@ -32,14 +32,14 @@ _COARSE = 0.01
 _FUNCTIONS = {"": arrays.ANGLE, "sin": arrays.SINE, "cos": arrays.COSINE}
 
 
-def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:
+def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], model_folder_hash: str = "") -> None:
     """Write the file that `CompiledIK.load` reads.
 
     Args:
         model: model to convert.
         file: file to write.
-        belongs_to: `content_hash` of the model folder, which is stored in the file; a file with a different hash is out
-            of date.
+        model_folder_hash: `content_hash` of the model folder, which is stored in the file; a file with a different hash
+            is out of date.
 
     Raises:
         ModelError: the model has no compiled form, see `describe_as_arrays`.
@@ -52,7 +52,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
         branches=branches,
         joints=joints,
         name=model.name,
-        belongs_to=belongs_to,
+        belongs_to=model_folder_hash,
         warnings=condition_warnings(model),
     )
 

@@ -19,7 +19,13 @@ from pisigma.estimation.alternatives import Cause
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import ModelError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance, corrected_joints, known_names
+from pisigma.model.calibrated_model import (
+    CalibratedModel,
+    Frames,
+    Provenance,
+    corrected_joints,
+    model_names_of_rows,
+)
 from pisigma.model.geometric_model import branches_of, model_of_calibration
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
@@ -85,9 +91,9 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, frame_choice: Fr
     arm = model.hybrid
     bases, tools = (model.bases, model.tools) if arm is None else (model.hybrid_bases, model.hybrid_tools)
     if frame_choice == "tool":
-        rows = replace(rows, frame=known_names(bases, rows.frame, "frame", rows))
+        rows = replace(rows, frame=model_names_of_rows(bases, rows.frame, "frame", rows))
     if frame_choice == "base":
-        rows = replace(rows, target=known_names(tools, rows.target, "target", rows))
+        rows = replace(rows, target=model_names_of_rows(tools, rows.target, "target", rows))
     moved = rows if arm is None else replace(rows, q=corrected_joints(arm, rows))
     fit = fit_frames(model.identified, moved, frame_choice, bases, tools)
     known = None if model.uncertainty is None else ArmUncertainty(model.uncertainty, rows)

@@ -75,7 +75,7 @@ def nearest_branch(solver: AbstractClosedForm, q: Float64[Tensor, "poses dof"]) 
     return torch.where(known, solver.nearest(forward_kinematics(solver.robot, safe), safe)[1], 0)
 
 
-def rows_at_starts(starts: Float64[Tensor, "starts dof"], q: Float64[Tensor, "rows dof"]) -> int:
+def count_rows_at_starts(starts: Float64[Tensor, "starts dof"], q: Float64[Tensor, "rows dof"]) -> int:
     """Return the number of rows whose joint values [rad or m] are among the values that a model stores."""
     kept = {tuple(row) for row in (starts / SAME).round().tolist()}
     return sum(tuple(row) in kept for row in (q / SAME).round().tolist())

@@ -11,22 +11,24 @@ from pisigma.measurement.copies import RowValues, copies_of_known, places_text
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.exceeded_limits import with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.stored_starts import rows_at_starts
+from pisigma.model.stored_starts import count_rows_at_starts
 from pisigma.robot.description import Robot
 
 _MAX_KEPT_ROWS = 10_000
 """Largest number of rows whose joint values and readings a model stores."""
 
 
-def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
-    """Return the values of training rows that a model stores, following its earlier training rows `before`."""
+def stored_training_rows(
+    robot: Robot, rows: Measurements, earlier_values: RowValues | None = None
+) -> RowValues:
+    """Return the values of training rows that a model stores, following its earlier training rows `earlier_values`."""
     values = RowValues.from_rows(rows.as_fields(), robot)
-    values = values if before is None else before + values
+    values = values if earlier_values is None else earlier_values + values
     count = len(values.numbers)
     return values.select(torch.linspace(0, count - 1, min(count, _MAX_KEPT_ROWS)).round().long())
 
 
-def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
+def training_row_mask(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
     """Return the mask of the model's training rows, even if these are rounded, reordered or only some of them."""
     if model.training_values is None:
         whole = bool(model.provenance.data_sha256) and model.provenance.data_sha256 == rows.content_hash()
@@ -40,7 +42,7 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
     Raises:
         MeasurementError: all rows are training rows of the model.
     """
-    known = known_rows(model, rows)
+    known = training_row_mask(model, rows)
     if bool(known.all()):
         raise MeasurementError(
             f"expected new rows, got only rows whose joint values and readings equal those of training rows of model "
@@ -84,7 +86,7 @@ def training_row_warnings(
     training_hash = model.provenance.data_sha256
     if training_hash and training_hash in (whole.content_hash() for whole in (rows, all_rows or rows)):
         return (f"{model.name} was calibrated with these rows, so {consequence}.",)
-    known = known_rows(model, rows)
+    known = training_row_mask(model, rows)
     if bool(known.any()):
         if bool(known.all()):
             return (f"{model.name} was calibrated with these rows, so {consequence}.",)
@@ -92,7 +94,7 @@ def training_row_warnings(
             f"{int(known.sum())} of {rows.rows} rows are training rows of {model.name} "
             f"({places_text(rows.as_fields(), known)}); for these, {consequence}.",
         )
-    at_starts = rows_at_starts(model.starts.double().cpu(), rows.q.cpu())
+    at_starts = count_rows_at_starts(model.starts.double().cpu(), rows.q.cpu())
     if not at_starts:
         return ()
     return (

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, choice_remedy
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import zyx_from_rotation
 
@@ -128,7 +128,7 @@ class Inputs:
     def _unknown(self, name: str) -> RecipeError:
         functions = [f"{f}({joint})" for f in ("sin", "cos") for joint in self.joint_names]
         choices = [*POSE_INPUTS, *self.joint_names, *functions]
-        hint = nearest_choice(name, choices)
+        hint = choice_remedy(name, choices)
         return RecipeError(f"unknown network input '{name}'", value=name, remedy=hint)
 
 

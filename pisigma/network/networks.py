@@ -22,7 +22,7 @@ from pisigma.network.trainer import SAVED, Checkpoints, train
 def fit_networks(
     networks: Sequence[PiSigma],
     patterns: Sequence[Patterns],
-    labels: Sequence[Sequence[str]],
+    joint_names: Sequence[Sequence[str]],
     fit: FitSection,
     *,
     checkpoints: Checkpoints | None = None,
@@ -34,7 +34,7 @@ def fit_networks(
     Args:
         networks: one network per joint group.
         patterns: scaled patterns of every network.
-        labels: names of the joints of every group.
+        joint_names: names of the joints of every group.
         fit: method and settings.
         checkpoints: folder and settings of checkpoints; None writes no checkpoints.
         show_progress: whether to draw a progress bar on stderr if it is a terminal.
@@ -45,8 +45,8 @@ def fit_networks(
             and data to resume from.
         OutputError: checkpoints cannot be written.
     """
-    _check_finite(patterns, labels)
-    module = NetworkTraining(networks, fit, labels)
+    _check_finite(patterns, joint_names)
+    module = NetworkTraining(networks, fit, joint_names)
     batches, epochs = _batches(patterns, fit)
     train(module, batches, epochs, checkpoints=checkpoints, show_progress=show_progress, logs=logs)
     module.write_networks()

@@ -31,7 +31,7 @@ camera and board may be mounted on a box."""
 
 
 @dataclass(frozen=True, eq=False)
-class BoardViews:
+class ViewConditions:
     """Conditions under which a camera sees a whole board, sharply and not too obliquely.
 
     Attributes:
@@ -53,10 +53,10 @@ class BoardViews:
     @staticmethod
     def from_sight(
         sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection
-    ) -> "BoardViews":
+    ) -> "ViewConditions":
         """Read the conditions from the section `view` of the surroundings."""
         nearest, farthest = view.sharp_depths(sight.camera.fx)
-        return BoardViews(
+        return ViewConditions(
             sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px
         )
 

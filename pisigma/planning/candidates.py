@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.groups import groups_of_equal_joints
-from pisigma.planning.board_views import BoardViews
+from pisigma.planning.board_views import ViewConditions
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings, Faults
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.joint_limits import nearest_turn
@@ -82,7 +82,7 @@ def draw_candidates(
     count: int,
     seed: int,
     workspace: Workspace | None = None,
-    views: BoardViews | None = None,
+    views: ViewConditions | None = None,
 ) -> Candidates:
     """Draw candidates until enough are allowed or too many were refused.
 
@@ -118,7 +118,9 @@ def draw_candidates(
     return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
 
-def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candidates) -> Candidates:
+def with_workspace(
+    arm: ArmInSurroundings, candidates: Candidates, workspace_candidates: Candidates
+) -> Candidates:
     """Add the whole workspace to candidates that cover part of it, and unwrap the joint values of both.
 
     A joint that is rarely free at some angles, such as a shoulder above a floor, is unwrapped about the centre of the
@@ -127,10 +129,12 @@ def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candi
     Args:
         arm: the robot in its surroundings.
         candidates: candidates.
-        others: poses in the whole workspace.
+        workspace_candidates: poses in the whole workspace.
     """
-    angles = torch.arange(-180, 180, 5).to(others.q).deg2rad()
-    density = ((others.q[:, None] - angles[:, None]).cos() / _KERNEL_WIDTH**2).softmax(1).mean(0)
+    angles = torch.arange(-180, 180, 5).to(workspace_candidates.q).deg2rad()
+    density = (
+        ((workspace_candidates.q[:, None] - angles[:, None]).cos() / _KERNEL_WIDTH**2).softmax(1).mean(0)
+    )
     rarest = density.min(0)
     middle = torch.where(
         rarest.values < _RARE_SHARE / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
@@ -141,14 +145,14 @@ def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candi
         values, (lower, upper) = arm.robot.to_controller(near), arm.limits.t()
         return torch.where(((values >= lower) & (values <= upper)).all(1, keepdim=True), near, q)
 
-    return replace(candidates, q=unwrapped(candidates.q), workspace=unwrapped(others.q))
+    return replace(candidates, q=unwrapped(candidates.q), workspace=unwrapped(workspace_candidates.q))
 
 
 def read_candidates(
     arm: ArmInSurroundings,
     path: str | os.PathLike[str],
     workspace: Workspace | None = None,
-    views: BoardViews | None = None,
+    views: ViewConditions | None = None,
 ) -> Candidates:
     """Return candidates from the joint values in a file; repeated joint values count once.
 
@@ -207,7 +211,7 @@ def _faults(
     arm: ArmInSurroundings,
     q: Float64[Tensor, "poses dof"],
     workspace: Workspace | None,
-    views: BoardViews | None,
+    views: ViewConditions | None,
 ) -> Faults:
     """Return the faults of poses with respect to surroundings, workspace and camera."""
     failed = {} if views is None else {_UNREACHED: q.isnan().any(1)}

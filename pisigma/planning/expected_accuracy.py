@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.estimation.covariance_root import multiply_updated_root
 from pisigma.measurement.camera.camera_files import Repeatability
-from pisigma.planning.board_views import BoardViews
+from pisigma.planning.board_views import ViewConditions
 from pisigma.planning.candidates import Candidates
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
@@ -194,7 +194,7 @@ class CameraProspects:
         candidates: Candidates,
         chosen: Int64[Tensor, " chosen"],
         task: Float64[Tensor, "tasks dof"],
-        views: BoardViews,
+        views: ViewConditions,
         arm: ArmInSurroundings,
     ) -> "CameraProspects":
         """Return the predicted errors of the planned images.

@@ -15,9 +15,9 @@ from pisigma.measurement.csv.reading import contains_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.exceeded_limits import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.training_rows import known_rows, training_row_warnings
+from pisigma.model.training_rows import training_row_mask, training_row_warnings
 from pisigma.planning.board_sight import BoardSight
-from pisigma.planning.board_views import BoardViews
+from pisigma.planning.board_views import ViewConditions
 from pisigma.planning.candidates import (
     Candidates,
     Workspace,
@@ -104,7 +104,7 @@ def read_planned_rows(settings: PlanSettings, path: str | os.PathLike[str], robo
     return read_rows(path, robot, None if settings.camera is None else settings.camera.files)
 
 
-def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | None:
+def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> ViewConditions | None:
     """Return the conditions under which the camera sees its board; None without a camera.
 
     Raises:
@@ -122,7 +122,7 @@ def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | Non
             remedy="state them as view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}, and "
             f"the pose of the {target} on the flange as tool",
         )
-    return BoardViews.from_sight(sight_of(settings.camera), view.T_cell_frame, view)
+    return ViewConditions.from_sight(sight_of(settings.camera), view.T_cell_frame, view)
 
 
 def sight_of(camera: CameraSettings) -> BoardSight:
@@ -151,7 +151,7 @@ def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot:
     against = robot if model is None else model
     if implausible := check_rows(rows, against, allowed_moves=MOVES).implausible_findings:
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
-    if model is not None and bool(known_rows(model, rows).all()):
+    if model is not None and bool(training_row_mask(model, rows).all()):
         raise MeasurementError(
             f"expected rows to which model '{model.name}' was not fitted, got only rows of its calibration, which "
             "would count twice",

@@ -14,7 +14,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.noise import JOINT
 from pisigma.calibration.hybrid.result import HybridResult
-from pisigma.calibration.hybrid.sensor_values import joint_columns
+from pisigma.calibration.hybrid.sensor_values import joint_value_parameters
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot, multiply_updated_root
 from pisigma.files.errors import IdentificationError, ImplausibleError
@@ -225,7 +225,7 @@ class RobotPosterior:
         deviation = self.uncertainty.noise.value.get(JOINT, of_class)
         if not deviation:
             return columns
-        J = deviation * columns[..., joint_columns(self.uncertainty.space)]
+        J = deviation * columns[..., joint_value_parameters(self.uncertainty.space)]
         noise = torch.eye(columns.shape[1], dtype=columns.dtype) + J @ J.mT
         whitened: Tensor = torch.linalg.solve_triangular(torch.linalg.cholesky(noise), columns, upper=False)
         return whitened

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import PlanningError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, load_model
-from pisigma.planning.board_views import BoardViews
+from pisigma.planning.board_views import ViewConditions
 from pisigma.planning.plan_inputs import instrument_of, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.robot_posterior import RobotPosterior
@@ -124,7 +124,7 @@ class RobotOrModel:
         return posterior.updated_with(rows) if self.model is None else posterior.after_measuring(rows.q)
 
     def _seen_by_camera(
-        self, arm: ArmInSurroundings, settings: PlanSettings, views: BoardViews
+        self, arm: ArmInSurroundings, settings: PlanSettings, views: ViewConditions
     ) -> RobotPosterior:
         """Return the distribution of the unknowns in the frame of the board, or of a fixed camera.
 

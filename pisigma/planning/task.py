@@ -29,7 +29,7 @@ _STARTS = 200
 """Number of joint vectors at which a numeric inverse kinematics starts."""
 
 
-def task_poses(
+def task_joint_values(
     arm: ArmInSurroundings,
     settings: PlanSettings,
     q: Float64[Tensor, "poses dof"],

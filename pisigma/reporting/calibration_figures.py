@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTa
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure, set_margins
-from pisigma.validation.held_out.pose_statistics import WITHIN, PredictedSpread
+from pisigma.validation.held_out.pose_statistics import WITHIN, ErrorsWithPredictedSigma
 from pisigma.validation.held_out.validation_figures import LearningPoint
 from pisigma.validation.report.corrections import JOINT_UNITS
 
@@ -227,7 +227,7 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
     save_figure(figure, path)
 
 
-def draw_spread(spread: PredictedSpread, path: Path) -> None:
+def draw_spread(spread: ErrorsWithPredictedSigma, path: Path) -> None:
     """Draw errors of held-out coordinates against their predicted standard deviations.
 
     The diamonds are the RMS errors of bins with equal numbers of values; they should be on the line.

@@ -23,7 +23,7 @@ _Lines = list[tuple[str, Sequence[str]]]
 
 
 def comparison_tables(
-    comparison: ModelComparison, data: str, width: int, full: bool = True
+    comparison: ModelComparison, rows_name: str, width: int, full: bool = True
 ) -> list[tuple[str, Table]]:
     """Return titled tables of the errors of every model, and of the differences to the first model.
 
@@ -31,12 +31,12 @@ def comparison_tables(
 
     Args:
         comparison: comparison of one model or more.
-        data: name of the rows.
+        rows_name: name of the rows.
         width: width of the screen [characters].
         full: show all figures; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
     """
     names = [model.name for model in comparison.models]
-    rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
+    rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {rows_name}"
     tables = [(f"Errors of {rows}", names, _error_lines(comparison, full))]
     if len(names) > 1:
         title = f"Differences from {names[0]} on the same rows, negative is better"
@@ -53,12 +53,12 @@ def model_rms_text(figures: ModelFigures, rows: int) -> str:
 
 
 def comparison_blocks(
-    comparison: ModelComparison, data: str, width: int, verbose: bool
+    comparison: ModelComparison, rows_name: str, width: int, verbose: bool
 ) -> tuple[list[Block], list[Block]]:
     """Return the errors of models on rows as text; unless `verbose`, remarks state which figures are omitted."""
 
     def blocks(full: bool) -> list[Block]:
-        tables = comparison_tables(comparison, Path(data).name, width, full)
+        tables = comparison_tables(comparison, Path(rows_name).name, width, full)
         return [
             table_block(title, *cells, "all statistics" if full else title.split()[0].lower())
             for title, cells in tables

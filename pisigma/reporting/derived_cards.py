@@ -152,7 +152,7 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
         summary=summary,
         parameters=common_error_table(summary),
         undetermined=UNDETERMINED,
-        spectrum=spectrum_table(summary),
+        spectrum=weight_spread_table(summary),
     )
 
 
@@ -165,7 +165,7 @@ def common_error_table(summary: FleetPriorSummary) -> Table:
     return Table(("parameter", "unit", "mean", "between robots", "remark"), tuple(rows))
 
 
-def spectrum_table(summary: FleetPriorSummary) -> Table:
+def weight_spread_table(summary: FleetPriorSummary) -> Table:
     """Return a table of standard deviations between robots of the weights of the joint correction, by group."""
     return Table(
         ("weights", "between robots [deg]"),

@@ -31,7 +31,7 @@ def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
 
 
 def robot_of_origins(
-    similar_robot: Robot, origins: list[Frame], end: Frame, nearly_parallel: float = NEARLY_PARALLEL
+    similar_robot: Robot, origins: list[Frame], end: Frame, nearly_parallel_sine: float = NEARLY_PARALLEL
 ) -> Robot:
     """Return a robot with the given joint frames, and with base, tool, names and limits of another robot.
 
@@ -39,7 +39,7 @@ def robot_of_origins(
         similar_robot: the other robot, with the same number of joints.
         origins: joint frames as returned by `joint_origins`.
         end: transform from the last joint to the frame to which the tool is attached.
-        nearly_parallel: see `rows_of_chain`.
+        nearly_parallel_sine: see `rows_of_chain`.
 
     Returns:
         A robot with one row per joint, in DH parameters or, between nearly parallel axes, Hayati parameters.
@@ -55,7 +55,7 @@ def robot_of_origins(
         )
         for row, origin in zip(similar_robot.joints, origins, strict=True)
     )
-    fields = rows_of_chain(Chain(similar_robot.name, "", "", joints, end, ""), nearly_parallel).fields
+    fields = rows_of_chain(Chain(similar_robot.name, "", "", joints, end, ""), nearly_parallel_sine).fields
     moved = replace(similar_robot, rows=similar_robot.joints, dh=fields.dh, urdf=None)
     base, tool = (
         frame_of(similar_robot.base) @ frame_of(fields.base),

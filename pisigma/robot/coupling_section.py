@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field
 
-from pisigma.files.errors import RobotError, nearest_choice
+from pisigma.files.errors import RobotError, choice_remedy
 from pisigma.files.yaml_file import Section
 from pisigma.robot.coupling import Coupling, FourBar, dh_limits
 from pisigma.robot.row import MAX_MAGNITUDE, BoundedFloat, Row
@@ -115,7 +115,7 @@ def _check_names(sections: Sequence[CoupledJointSection], names: Sequence[str]) 
     """Check that every section names existing joints, and that no joint has two sections."""
     for name in (name for section in sections for name in (section.joint, *section.factors)):
         if name not in names:
-            remedy = nearest_choice(name, names)
+            remedy = choice_remedy(name, names)
             raise RobotError(f"there is no joint '{name}'", value=name, option="coupling", remedy=remedy)
     joints = [section.joint for section in sections]
     if twice := [name for name in names if joints.count(name) > 1]:

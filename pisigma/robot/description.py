@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import PoseError, RobotError, nearest_choice
+from pisigma.files.errors import PoseError, RobotError, choice_remedy
 from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import MAX_MAGNITUDE, MAX_ROWS, JointType, Row
@@ -221,7 +221,7 @@ def _check_row(row: Row, place: str) -> None:
     """Check the type, direction and limits of a row; `place` precedes the message."""
     types = get_args(JointType)
     if row.type not in types:
-        hint = nearest_choice(row.type, types)
+        hint = choice_remedy(row.type, types)
         raise RobotError(f"{place}: unknown joint type '{row.type}'", value=row.type, remedy=hint)
     if row.direction not in (1, -1):
         problem = f"{place}: expected the direction +1 or -1, got {row.direction}"

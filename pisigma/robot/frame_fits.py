@@ -151,7 +151,7 @@ def _rotation_weights(
     return (there if weight is None else weight * there)[..., None, None]
 
 
-def affine_error(
+def affine_squared_error(
     T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
     """Compute the residual mean squared error [m²] per row of the best affine base and tool, a bound for rigid ones.
@@ -179,11 +179,11 @@ def affine_error(
 def smallest_error(
     T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
-    """Return a lower bound of the RMS error [m] with any base and tool; 0 for too few rows for `affine_error`."""
+    """Return a lower bound of the RMS error [m] with any base and tool; 0 with too few rows for one."""
     rows = T.shape[-3]
     if rows <= AFFINE_UNKNOWNS:
         return torch.zeros_like(T[..., 0, 0, 0])
-    return (affine_error(T, measured) * (1 - AFFINE_UNKNOWNS / rows)).sqrt()
+    return (affine_squared_error(T, measured) * (1 - AFFINE_UNKNOWNS / rows)).sqrt()
 
 
 def best_base_and_tool(
@@ -193,7 +193,7 @@ def best_base_and_tool(
 
     Without measured rotations, Y is a translation.
 
-    The initial guess is the affine fit of `affine_error` with its matrices replaced by the nearest rotations. It is
+    The initial guess is the affine fit of `affine_squared_error` with the nearest rotations as its matrices. It is
     refined by the Levenberg-Marquardt method on all batches at once.
 
     Args:
@@ -269,7 +269,7 @@ def _nearest_rotations(columns: Float64[Tensor, "*batch 9 1"]) -> Float64[Tensor
 def _affine_base_and_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Estimate base and tool in closed form; see `affine_error`."""
+    """Estimate base and tool in closed form; see `affine_squared_error`."""
     R, p, position = T[..., :3, :3], T[..., :3, 3], measured.position
     R_tool = torch.eye(3).to(T).expand(*T.shape[:-3], 3, 3)
     if bool(measured.has_rotation.any()):
@@ -329,7 +329,7 @@ def base_and_tool_step(
     base: Float64[Tensor, "*batch 4 4"],
     tool: Float64[Tensor, "*batch 4 4"],
     damping: Float64[Tensor, "*batch"],
-    free: Float64[Tensor, "*batch rows 6"] | None = None,
+    eliminated_direction: Float64[Tensor, "*batch rows 6"] | None = None,
 ) -> Float64[Tensor, "*batch 12"]:
     """Compute a damped step: translation [m] and rotation [rad] of the base, in the measuring frame, then of the tool.
 
@@ -339,14 +339,16 @@ def base_and_tool_step(
         base: current base.
         tool: current tool.
         damping: Marquardt's damping, relative to the diagonal of the normal matrix.
-        free: translation [m] and rotation [rad] of every row's pose per unit of an unknown of that row, which is
-            eliminated (variable projection, Golub and Pereyra 1973); None for no such unknown.
+        eliminated_direction: translation [m] and rotation [rad] of every row's pose per unit of an unknown of that row,
+            which is eliminated (variable projection, Golub and Pereyra 1973); None for no such unknown.
     """
     J, error = frame_jacobian(T, measured, base[..., None, :, :], tool[..., None, :, :])
     residual = error[..., None]
-    if free is not None:
+    if eliminated_direction is not None:
         weight = measured.lever * measured.has_rotation.to(T)[..., None]
-        along = torch.cat([free[..., :3], weight * free[..., 3:]], -1)[..., None]
+        along = torch.cat([eliminated_direction[..., :3], weight * eliminated_direction[..., 3:]], -1)[
+            ..., None
+        ]
         # Projecting out this direction implicitly solves for the unknown of each row.
         along = along / along.norm(dim=-2, keepdim=True).clamp(min=1e-12)
         J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)

@@ -25,7 +25,7 @@ _PLAUSIBLE_SHARE: Final = 0.01
 
 
 @dataclass(frozen=True)
-class GeometricSizes:
+class GeometricErrorSizes:
     """Sizes of errors by kind of geometric parameter.
 
     The order is that of `pisigma.calibration.geometric.problem.prior_scales.PriorGroup`.
@@ -85,11 +85,11 @@ class RobotClass:
     """
 
     name: ClassName
-    prior_sizes: GeometricSizes
+    prior_sizes: GeometricErrorSizes
     gravity_sigma: float
     series_sigmas: tuple[float, ...]
     harmonics: int
-    max_sizes: GeometricSizes
+    max_sizes: GeometricErrorSizes
     max_changes: ChangeLimits
     max_calibrated_error_per_reach: float
     joint_repeatability: float = 0.0
@@ -112,11 +112,13 @@ class RobotClass:
 
 INDUSTRIAL: Final = RobotClass(
     name="industrial",
-    prior_sizes=GeometricSizes(joint_offset=1.5e-3, length=0.55e-3, zero_length=0.37e-3, axis_angle=0.7e-3),
+    prior_sizes=GeometricErrorSizes(
+        joint_offset=1.5e-3, length=0.55e-3, zero_length=0.37e-3, axis_angle=0.7e-3
+    ),
     gravity_sigma=2.7e-4,
     series_sigmas=(2.4e-4, 2.4e-4, 4e-6, 4e-6, 1.5e-4, 2e-6, 2e-6),
     harmonics=15,
-    max_sizes=GeometricSizes(joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3),
+    max_sizes=GeometricErrorSizes(joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3),
     max_changes=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
     max_calibrated_error_per_reach=2.5e-3,
 )
@@ -139,7 +141,9 @@ those of industrial arms unless arms of the manufacturer were measured."""
 
 UNIVERSAL_ROBOTS: Final = replace(
     COBOT,
-    prior_sizes=GeometricSizes(joint_offset=0.9e-3, length=0.45e-3, zero_length=0.1e-3, axis_angle=1.5e-3),
+    prior_sizes=GeometricErrorSizes(
+        joint_offset=0.9e-3, length=0.45e-3, zero_length=0.1e-3, axis_angle=1.5e-3
+    ),
     gravity_sigma=4e-4,
     series_sigmas=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
     harmonics=31,
@@ -151,8 +155,8 @@ robots cannot distinguish."""
 HOBBY: Final = replace(
     COBOT,
     name="hobby",
-    prior_sizes=GeometricSizes(joint_offset=30e-3, length=1e-3, zero_length=1e-3, axis_angle=5e-3),
-    max_sizes=GeometricSizes(joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3),
+    prior_sizes=GeometricErrorSizes(joint_offset=30e-3, length=1e-3, zero_length=1e-3, axis_angle=5e-3),
+    max_sizes=GeometricErrorSizes(joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3),
     max_changes=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
     max_calibrated_error_per_reach=7.5e-3,
 )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, model_validator
 
-from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
+from pisigma.files.errors import RobotError, UnknownRobotError, choice_remedy
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
 from pisigma.robot.robot_fields import RobotFields
@@ -190,7 +190,7 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     raise UnknownRobotError(
         f"'{name}' is neither a robot of the catalogue nor a .yaml or .urdf file",
         value=name,
-        remedy=nearest_choice(name, catalogue()),
+        remedy=choice_remedy(name, catalogue()),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import Place, RobotError, make_printable, nearest_choice
+from pisigma.files.errors import Place, RobotError, choice_remedy, make_printable
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of
 
@@ -85,7 +85,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
     _check_tree(urdf, place)
     for option, link in (("base", base), ("tip", tip)):
         if link is not None and link not in urdf.link_map:
-            problem, hint = f"there is no {option} link '{link}'", nearest_choice(link, links)
+            problem, hint = f"there is no {option} link '{link}'", choice_remedy(link, links)
             raise RobotError(problem, value=link, option=option, at=Place(path), remedy=hint)
     base = base or _root(urdf, Place(path))
     tip = tip or _only_tip(urdf, base, Place(path))
@@ -114,7 +114,7 @@ def _check_tree(urdf: Any, place: Callable[[str], Place]) -> None:
         for part, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in urdf.link_map:
                 problem = f"the {part} of joint '{joint.name}' is '{link}', which is not a link"
-                hint = nearest_choice(link, urdf.link_map)
+                hint = choice_remedy(link, urdf.link_map)
                 raise RobotError(problem, value=link, at=place(joint.name), remedy=hint)
         if joint.child in parents:
             raise RobotError(

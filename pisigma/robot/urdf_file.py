@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import Place, RobotError, nearest_choice
+from pisigma.files.errors import Place, RobotError, choice_remedy
 from pisigma.files.input_file import read_input
 from pisigma.robot.row import MAX_MAGNITUDE
 
@@ -21,12 +21,12 @@ _KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint", "multiplier", "offset"
 _VECTORS = {("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")}
 
 
-def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Callable[[str], Place]]:
+def read_urdf(path: str | os.PathLike[str], root_element: Any = None) -> tuple[Any, Callable[[str], Place]]:
     """Read a URDF file.
 
     Args:
         path: the file.
-        root: root element if the XML has already been parsed; see `parse_xml`.
+        root_element: root element if the XML has already been parsed; see `parse_xml`.
 
     Returns:
         The robot of pytorch-kinematics' URDF parser, with links and joints only, and a function that returns the place
@@ -38,10 +38,10 @@ def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Call
     """
     from lxml import etree
 
-    root = parse_xml(path) if root is None else root
-    reduced = etree.Element("robot", name=root.get("name") or Path(path).stem)
+    root_element = parse_xml(path) if root_element is None else root_element
+    reduced = etree.Element("robot", name=root_element.get("name") or Path(path).stem)
     lines: dict[tuple[str, str], int] = {}
-    for element in root.iterchildren("{*}link", "{*}joint"):
+    for element in root_element.iterchildren("{*}link", "{*}joint"):
         kind = etree.QName(element).localname
         name = element.get("name")
         if not name:
@@ -142,7 +142,7 @@ def _copy_joint(element: Any, copied: Any, path: str | os.PathLike[str]) -> None
     at = Place(path, element.sourceline)
     kind = element.get("type")
     if kind not in _JOINT_TYPES:
-        hint = nearest_choice(kind or "", _JOINT_TYPES)
+        hint = choice_remedy(kind or "", _JOINT_TYPES)
         raise RobotError(f"joint '{name}': unknown type '{kind}'", value=kind, at=at, remedy=hint)
     copied.set("type", kind)
     for child in element.iterchildren(*(f"{{*}}{tag}" for tag in _KEPT)):

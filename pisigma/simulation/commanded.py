@@ -12,7 +12,7 @@ from pisigma.robot.kinematics.closed_form import AbstractClosedForm, InverseSolu
 from pisigma.robot.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.kinematics.status import Status
-from pisigma.simulation.errors.source import stated_joints
+from pisigma.simulation.errors.source import values_by_joint_index
 from pisigma.simulation.poses import JointsRandom, WhereToMeasure
 from pisigma.simulation.true_robot import TrueRobot
 
@@ -97,7 +97,9 @@ class BranchSection(Section):
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
         """Return the controller values of `near_deg` and `near_mm` [rad or m]."""
         fields = ("near_deg", "near_mm")
-        stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", by_axis_name=True)
+        stated = values_by_joint_index(
+            robot, self.near_deg or {}, self.near_mm, fields, "branch", by_axis_name=True
+        )
         values = [axis.from_file_unit(stated.get(index, 0.0)) for index, axis in enumerate(robot.axes)]
         near: Tensor = robot.to_dh(torch.tensor(values, dtype=torch.float64))
         return near

@@ -14,7 +14,7 @@ from pisigma.files.errors import Phrase, RecipeError
 from pisigma.files.yaml_file import MAX_POSES, Count, Section, Seed
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_zyx, transform
-from pisigma.simulation.errors.source import stated_joints
+from pisigma.simulation.errors.source import values_by_joint_index
 
 Triple = tuple[float, float, float]
 
@@ -130,7 +130,7 @@ class JointsRandom(Section):
             middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
             bounds: np.ndarray = middle + self.range_fraction * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
-        ranges = stated_joints(
+        ranges = values_by_joint_index(
             robot, self.range_deg, self.range_mm, fields, "joints_random", by_axis_name=True
         )
         for index, stated in ranges.items():

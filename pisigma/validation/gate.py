@@ -17,7 +17,11 @@ from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
 from pisigma.validation.checks.row_order import instrument_moved_error
-from pisigma.validation.checks.setup_fault import check_joint_columns, check_position_size, setup_diagnostics
+from pisigma.validation.checks.setup_fault import (
+    check_joint_columns,
+    check_position_spread,
+    setup_diagnostics,
+)
 from pisigma.validation.checks.unexplained import check_residual_size
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
@@ -161,7 +165,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
     """Run the checks against the nominal robot, most reliable first."""
     yield _moved_setup(rows, robot)
     yield setup_diagnostics(robot, rows)
-    yield check_position_size(robot, rows)
+    yield check_position_spread(robot, rows)
     yield check_joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
     if rows.rows >= _MIN_ROWS_TO_CALIBRATE:

@@ -207,10 +207,10 @@ class CellScene:
                 self._scene.add_rows(q)
         self._server.flush()
 
-    def mark_lines(self, lines: list[int]) -> None:
+    def mark_lines(self, file_lines: list[int]) -> None:
         """Mark the rows of some lines in red with their numbers, and move the camera to the first of these rows."""
         with self._lock, self._server.atomic():
-            self._marked = lines
+            self._marked = file_lines
             if (place := self._draw_rows()) is not None:
                 for client in self._server.get_clients().values():
                     client.camera.look_at = place

@@ -108,7 +108,7 @@ def form_of_new_cell() -> list[Field]:
     return [replace(fields[key], option=option) for key, option in _NEW_CELL.items()]
 
 
-def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
+def changed_cell_text(file: CellFile, form: Mapping[str, str]) -> str:
     """Return the text of `cell.yaml` with the values of a form; fields that the form lacks do not change.
 
     Raises:

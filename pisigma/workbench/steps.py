@@ -34,18 +34,18 @@ from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workbench.forms import cell_file_text, changed_cell, changed_settings, digest_of
+from pisigma.workbench.forms import cell_file_text, changed_cell_text, changed_settings, digest_of
 from pisigma.workbench.job import Outcome, StoppedError
 from pisigma.workbench.tabs import CHARTS, download_of
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.acceptance import acceptance_of
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
-from pisigma.workflow.cell.exports import NONE, export_from_cell, set_controller
+from pisigma.workflow.cell.exports import NONE, export_from_cell, record_active_export
 from pisigma.workflow.cell.incoming_rows import IncomingRows
 from pisigma.workflow.cell.new_files import output_path
 from pisigma.workflow.follow import follow, remaining_poses_file
-from pisigma.workflow.load import load, stated_pose
+from pisigma.workflow.load import load, pose_from_mm_and_deg
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.report import report
 from pisigma.workflow.result_texts import (
@@ -102,7 +102,7 @@ def write_cell(folder: Path, form: Form, earlier_texts: dict[str, str]) -> None:
     text = (
         earlier_texts[undo]
         if undo
-        else changed_cell(CellFile.read(folder), form)
+        else changed_cell_text(CellFile.read(folder), form)
         if entered is None
         else entered
     )
@@ -332,7 +332,7 @@ def report_cell(cell: Cell, form: Form, progress: Progress) -> Outcome:
 def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
     """Compute the corrected joint values that reach a pose."""
     solver = load(cell.folder)
-    solution = solver(stated_pose([form_number(form, name) for name in POSE_COLUMNS]))
+    solution = solver(pose_from_mm_and_deg([form_number(form, name) for name in POSE_COLUMNS]))
     failed = [one for one in statuses_of(solution) if one in FAILURES]
     refusal = f"{failed[0].name.lower()}. {failed[0].sentence}" if failed else ""
     return Outcome(solution_text(solution, solver), refusal), solution
@@ -350,7 +350,7 @@ def set_active_export(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Record which export is active on the controller."""
     name = form.get("export", "")
     file = str(download_of(cell, "export", (name,))) if name else NONE
-    set_controller(cell, file, form.get("date", ""), form.get("note", ""))
+    record_active_export(cell, file, form.get("date", ""), form.get("note", ""))
     return Outcome()
 
 

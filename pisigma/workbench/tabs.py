@@ -167,12 +167,12 @@ class Tabs:
             context | _more(name, cell, status, earlier_texts)
         )
 
-    def render_proposal(self, incoming: IncomingRows, numbers: str) -> str:
+    def render_proposal(self, incoming: IncomingRows, file_numbers: str) -> str:
         """Render the proposed meaning of the columns of uploaded files.
 
         Args:
             incoming: the files.
-            numbers: numbers of the files, separated by commas.
+            file_numbers: numbers of the files, separated by commas.
         """
         names = [one.name for one in incoming.files]
         return self._environment.get_template("proposal.html.j2").render(
@@ -180,7 +180,7 @@ class Tabs:
             forms=form_of("import", incoming.cell.file),
             files=names,
             words=shlex.join(names),
-            numbers=numbers,
+            numbers=file_numbers,
         )
 
     def render_findings(
@@ -246,7 +246,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
         case "measure":
             return {"columns": [*joint_columns(cell.robot), *(f"{one}_mm" for one in POSITION)]}
         case "calibrate":
-            return {"figures": newest_model_figures(cell, status)}
+            return {"figures": newest_model_drawings(cell, status)}
         case "verify":
             return {"charts": [one for one in _names(cell.folder / REPORTS) if one.endswith(CHARTS)][:1]}
         case "deliver":
@@ -286,7 +286,7 @@ def timeline(status: CellStatus) -> list[TimelineEntry]:
     return sorted(entries, key=lambda one: one.day, reverse=True)
 
 
-def newest_model_figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
+def newest_model_drawings(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
     """Return the newest model and the names of its figures."""
     models = status.facts.models
     if not models:

@@ -22,7 +22,7 @@ _GROWING = "growing"
 """Name of the growing file in a form, instead of the number of an upload."""
 
 
-class UploadedRows:
+class UploadedRowsHandler:
     """Answers to the requests of a page about uploaded rows.
 
     Attributes:

@@ -29,7 +29,7 @@ from pisigma.workbench.server.answers import form_of, person_of, with_error_answ
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
 from pisigma.workbench.tabs import TABS, Tabs, download_of
-from pisigma.workbench.uploaded_rows import UploadedRows
+from pisigma.workbench.uploaded_rows import UploadedRowsHandler
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
@@ -60,7 +60,7 @@ _MAX_COMMAND = 2000
 """Longest command line that is shown."""
 
 
-class Workbench(UploadedRows):
+class Workbench(UploadedRowsHandler):
     """Page of a cell until it is closed: `with Workbench(folder) as bench: print(bench.url)`.
 
     Attributes:

@@ -19,7 +19,7 @@ from pisigma.joint_correction.registry import plugin_features
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.exceeded_limits import row_warnings, with_limits_of_rows
-from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
+from pisigma.measurement.sensors.socket import PairOfSockets, expand_socket_names
 from pisigma.measurement.splits import Splitting, draw_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
@@ -143,7 +143,7 @@ def calibrate(
     training = measurements.split_sets()[0]
     splitting = Splitting(settings.split, settings.seed, settings.folds, settings.hold_out)
     splits = splitting.split(training, settings.repeats, settings.train_rows)
-    distances = matching_sockets(settings.socket_distances, training.socket or ())
+    distances = expand_socket_names(settings.socket_distances, training.socket or ())
     calibrator = calibrator_of(settings, nominal, distances)
     drawn = None if settings.train_rows is None else draw_rows(training, settings.train_rows, settings.seed)
 
@@ -190,7 +190,7 @@ def compose_calibration(
     validation: CalibrationValidation | None = None,
     test: CalibrationValidation | None = None,
     held_out: Measurements | None = None,
-    recipe: tuple[str, str] = ("", ""),
+    recipe_name_and_hash: tuple[str, str] = ("", ""),
     diagnostics: tuple[Diagnostic, ...] = (),
 ) -> Calibration:
     """Check a calibration, and build its model and summary.
@@ -204,7 +204,7 @@ def compose_calibration(
         validation: errors of held-out rows.
         test: errors of the rows of the set "test".
         held_out: rows of the validation whose errors the model folder stores; None to store no errors.
-        recipe: name and SHA-256 of the recipe; empty without a recipe.
+        recipe_name_and_hash: name and SHA-256 of the recipe; empty without a recipe.
         diagnostics: findings before the calibration.
 
     Raises:
@@ -229,7 +229,9 @@ def compose_calibration(
     )
     if kept is not None:
         summary = summary.with_figures(held_out_rows=kept.compute_hashes(kept.to_csv(nominal)))
-    model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)
+    model = model_of_calibration(
+        recipe_name_and_hash[0] or nominal.name, nominal, geometric_result(result), rows, recipe_name_and_hash
+    )
     if isinstance(result, HybridResult):
         model = with_hybrid(model, result, rows)
     model = replace(model, metrics=summary.to_json())
@@ -286,7 +288,7 @@ def calibrator_of(
     # An error that several distances share is not averaged out by them.
     names = [name for pair in distances for name in pair]
     shared = max(
-        (len(matching_sockets({pair: one}, names)) for pair, one in settings.socket_distances.items()),
+        (len(expand_socket_names({pair: one}, names)) for pair, one in settings.socket_distances.items()),
         default=1,
     )
     geometric = GeometricCalibrator(

@@ -12,7 +12,7 @@ from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.exceeded_limits import row_warnings
-from pisigma.measurement.sensors.socket import matching_sockets
+from pisigma.measurement.sensors.socket import expand_socket_names
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, load_model, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
@@ -149,7 +149,7 @@ def evaluate(
     rows = test_rows(everything)
     compared = with_references(list(sources), loaded, rows.rotation is not None)
     hashes = everything.content_hash(), rows.content_hash()
-    distances = matching_sockets(settings.socket_distances, rows.socket or ())
+    distances = expand_socket_names(settings.socket_distances, rows.socket or ())
     right = without_wrong_rows(loaded.values(), rows, settings.fitted_kinds)
     rows = right.rows
     comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted_kinds, distances)

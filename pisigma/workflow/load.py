@@ -87,16 +87,16 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
     return ik
 
 
-def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
+def pose_from_mm_and_deg(xyzrpy_mm_deg: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
     """Return a stated pose T_base_tool as a batch `(1, 4, 4)` [m].
 
     Args:
-        values: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the frame of the measurements.
+        xyzrpy_mm_deg: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the frame of the measurements.
 
     Raises:
         PoseError: a value is not valid for a pose.
     """
-    for name, value in zip(FRAME_COLUMNS, values, strict=True):
+    for name, value in zip(FRAME_COLUMNS, xyzrpy_mm_deg, strict=True):
         if not abs(value) <= MAX_MAGNITUDE:
             raise PoseError(
                 expected=f"a finite length [mm] or angle [deg] as {name} of the pose",
@@ -105,6 +105,6 @@ def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
                 remedy="give X Y Z ROLL PITCH YAW",
             )
     T: Float64[np.ndarray, "1 4 4"] = transform_of(
-        [*(value / 1e3 for value in values[:3]), *map(math.radians, values[3:])]
+        [*(value / 1e3 for value in xyzrpy_mm_deg[:3]), *map(math.radians, xyzrpy_mm_deg[3:])]
     )[None]
     return T

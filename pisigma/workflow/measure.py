@@ -40,7 +40,7 @@ from pisigma.planning.session.state import (
     coverage,
 )
 from pisigma.planning.subject import RobotOrModel
-from pisigma.planning.task import task_poses
+from pisigma.planning.task import task_joint_values
 from pisigma.robot.se3 import transform_from_xyz_zyx
 from pisigma.workflow.settings.measuring import MeasureSettings
 
@@ -79,7 +79,7 @@ class MeasuringSession:
         candidates = find_candidates(plan.settings, plan.arm)
         subject = RobotOrModel(plan.arm.nominal) if plan.model is None else RobotOrModel.load(plan.model)
         self._against = subject.model or plan.arm.robot
-        self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
+        self._task = task_joint_values(plan.arm, plan.settings, candidates.workspace, subject.model)
         self._further = FurtherPoses.from_plan(plan, candidates, self._task)
         self._before = subject.posterior(plan.arm, replace(plan.settings, measured=None))
         self._planned, self._planned_check = plan.q, plan.check

@@ -19,7 +19,7 @@ from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel
-from pisigma.planning.board_views import BoardViews
+from pisigma.planning.board_views import ViewConditions
 from pisigma.planning.candidates import Candidates, select_spread_poses
 from pisigma.planning.expected_accuracy import (
     CameraProspects,
@@ -37,7 +37,7 @@ from pisigma.planning.subject import RobotOrModel
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
-from pisigma.planning.task import task_poses
+from pisigma.planning.task import task_joint_values
 from pisigma.planning.tour import Tour, order_of_use, plan_tour, stage_ends
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
@@ -146,7 +146,7 @@ class Plan:
             write_atomically(file, text)
 
 
-def check_files(
+def check_plan_outputs(
     path: Path, programs: Sequence[Path], settings: PlanSettings, robot: Robot, inputs: Sequence[Input]
 ) -> None:
     """Check that a plan can be written, before it is computed.
@@ -197,7 +197,7 @@ def plan(
     progress("prior knowledge")
     repeated = check_measured(subject.model, settings, arm.robot)
     posterior = subject.posterior(arm, settings)
-    task = task_poses(arm, settings, candidates.workspace, subject.model)
+    task = task_joint_values(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, posterior, task)
     chosen, stored, way, usable = problem.choose(progress)
     progress("expected accuracy")
@@ -242,7 +242,7 @@ class _Problem:
     task: Float64[Tensor, "tasks dof"]
 
     @cached_property
-    def views(self) -> BoardViews | None:
+    def views(self) -> ViewConditions | None:
         """Constraints on the views of the board; None without a camera."""
         return views_of(self.settings, self.arm)
 

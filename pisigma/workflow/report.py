@@ -19,7 +19,7 @@ from pisigma.measurement.exceeded_limits import limit_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
-from pisigma.reporting.page.drawing import check_figures, write_figures
+from pisigma.reporting.page.drawing import check_figures_writable, write_figures
 from pisigma.reporting.page.figures import ReportFigures, draw_figures
 from pisigma.reporting.page.page import render_page
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
@@ -58,13 +58,13 @@ class Report:
         return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds} | accepted
 
     def save(
-        self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
+        self, page: str | os.PathLike[str], figure_folder: str | os.PathLike[str] | None = None
     ) -> tuple[Path, ...]:
         """Write the HTML page and, if a folder is given, every figure as PNG and SVG.
 
         Args:
             page: file of the page (.html); replaced completely or not at all.
-            figures: folder of the figures, created if missing.
+            figure_folder: folder of the figures, created if missing.
 
         Returns:
             The files of the figures.
@@ -72,29 +72,29 @@ class Report:
         Raises:
             OutputError: a file cannot be written.
         """
-        check_report_outputs(page, figures)
+        check_report_outputs(page, figure_folder)
         write_atomically(Path(page), render_page(self.content, self.figures, self.acceptance))
-        return () if figures is None else tuple(write_figures(self.figures.all, Path(figures)))
+        return () if figure_folder is None else tuple(write_figures(self.figures.all, Path(figure_folder)))
 
 
 def check_report_outputs(
     page: str | os.PathLike[str],
-    figures: str | os.PathLike[str] | None = None,
+    figure_folder: str | os.PathLike[str] | None = None,
     inputs: Sequence[Input] = (),
 ) -> None:
     """Check that a report can be written, before it is computed.
 
     Args:
         page: file of the page.
-        figures: folder of the figures; None for no files of figures.
+        figure_folder: folder of the figures; None for no files of figures.
         inputs: files and folders that are read.
 
     Raises:
         OutputError: the page is not an .html file, or an output cannot be written or is inside an input or a model.
     """
     check_output(Path(page), (".html", ".htm"), "a report", inputs)
-    if figures is not None:
-        check_figures(Path(figures), inputs)
+    if figure_folder is not None:
+        check_figures_writable(Path(figure_folder), inputs)
 
 
 def report(

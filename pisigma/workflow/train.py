@@ -163,7 +163,9 @@ def _train_geometric(
         paper=recipe.model_dump(mode="json")["paper"] or None,
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
-    return compose_calibration(calibrator, result, rows, summary, texts, recipe=(recipe.name, sha256))
+    return compose_calibration(
+        calibrator, result, rows, summary, texts, recipe_name_and_hash=(recipe.name, sha256)
+    )
 
 
 def _train_hybrid(
@@ -208,7 +210,7 @@ def _train_hybrid(
         validation,
         test,
         held_out=rows if measured else None,
-        recipe=(recipe.name, sha256),
+        recipe_name_and_hash=(recipe.name, sha256),
     )
 
 

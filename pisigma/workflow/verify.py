@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from pisigma.lifetime.monitoring.session import Session
+from pisigma.lifetime.monitoring.session import SessionResult
 from pisigma.lifetime.recalibration.motion import find_motion, motion_sentence, motion_warnings
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.exceeded_limits import row_warnings
-from pisigma.measurement.sensors.socket import matching_sockets
+from pisigma.measurement.sensors.socket import expand_socket_names
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.stated_conditions import condition_warnings
@@ -101,7 +101,7 @@ class Verification:
     comparison: ModelComparison
     diagnostics: tuple[Diagnostic, ...]
     setup_faults: tuple[SetupFault, ...]
-    movements: Session | None
+    movements: SessionResult | None
     recalibration_command: str
     warnings: tuple[str, ...]
     seconds: float
@@ -169,7 +169,7 @@ def verify(
     settings, started = settings or VerificationSettings(), time.perf_counter()
     loaded, folder = loaded_model(model)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
-    distances = matching_sockets(settings.socket_distances, rows.socket or ())
+    distances = expand_socket_names(settings.socket_distances, rows.socket or ())
     right = without_wrong_rows([loaded], rows, settings.fitted_kinds)
     rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
@@ -228,7 +228,7 @@ def _compared_models(model: CalibratedModel, with_orientation: bool) -> dict[str
     return models | {CORRECTED: model}
 
 
-def _recalibration(name: str, data: str, settings: VerificationSettings, motion: Session | None) -> str:
+def _recalibration(name: str, data: str, settings: VerificationSettings, motion: SessionResult | None) -> str:
     """Return the command that updates a model; empty if a recalibration is not recommended."""
     if motion is None or not motion.recalibrate:
         return ""
@@ -241,7 +241,7 @@ def _motion(
     fitted: Sequence[FrameKind],
     comparison: ModelComparison,
     faults: Sequence[SetupFault],
-) -> Session | None:
+) -> SessionResult | None:
     """Return the moved parts; None if another setup fault or the nominal robot explains the rows better."""
     if any(not _MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
@@ -326,7 +326,7 @@ def _warnings(
     rows: Measurements,
     comparison: ModelComparison,
     faults: Sequence[SetupFault],
-    motion: Session | None,
+    motion: SessionResult | None,
 ) -> list[str]:
     warnings = [
         *row_warnings(model.robot, rows),

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.estimation.drift import LOG_PRIOR_PENALTY, SIZES, Drift, DriftGroup, DriftSearch, LinearValues
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.regression import SensorValueCount
 
 NOISE, MOVED = 1e-4, 4e-3
 
@@ -24,7 +24,8 @@ def search(moved: float, seed: int = 0, stated: bool = False) -> DriftSearch:
     groups = [DriftGroup("lengths", torch.arange(3), torch.ones(3).double())]
     groups += [DriftGroup(f"joint {k}", torch.tensor([2 + k]), torch.ones(1).double()) for k in (1, 2, 3, 4)]
     values = LinearValues(
-        *(X, y, torch.zeros(50, dtype=torch.int64), torch.arange(50)), (SensorCount(50.0, stated, stated),)
+        *(X, y, torch.zeros(50, dtype=torch.int64), torch.arange(50)),
+        (SensorValueCount(50.0, stated, stated),),
     )
     noise = torch.tensor([NOISE]).double()
     return DriftSearch(values, X @ root, groups, noise, noise)

@@ -6,7 +6,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.estimation.drift import MAX_DIRECTIONS, Drift, DriftGroup, LinearValues, PosteriorUpdate
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.regression import SensorValueCount
 
 UNKNOWNS, DIRECTIONS, NOISE = 30, 32, 0.3
 
@@ -18,7 +18,7 @@ def test_the_posterior_is_that_of_kalman(count, drifted):
     root, X, y = (torch.from_numpy(rng.normal(size=n)) for n in ((30, 32), (count, 30), (count,)))
     root[4] = 0.0  # a parameter that was not free
     group = DriftGroup("lengths", torch.arange(drifted), torch.full((drifted,), 0.5).double(), 2.0)
-    sensor, counts = torch.zeros(count, dtype=torch.int64), (SensorCount(float(count), False, False),)
+    sensor, counts = torch.zeros(count, dtype=torch.int64), (SensorValueCount(float(count), False, False),)
     values = LinearValues(X, y, sensor, torch.arange(count), counts)
     update = PosteriorUpdate(root, values, Drift((group,), torch.tensor([NOISE]).double()))
     C = root @ root.t()

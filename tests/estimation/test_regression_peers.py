@@ -15,7 +15,7 @@ from torch import Tensor
 from pisigma.estimation.dual_regression import DualRegression, group_gram, stack_groups
 from pisigma.estimation.primal_regression import PrimalRegression
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import AbstractRegression, SensorCount
+from pisigma.estimation.regression import AbstractRegression, SensorValueCount
 
 VALUES, WEIGHTS = 30, 6
 
@@ -32,7 +32,7 @@ def random_case(values: int = VALUES, parameters: int = 0) -> tuple[Tensor, Tens
 
 
 def both_forms(X: Tensor, y: Tensor, prior: GaussianPrior) -> dict[str, AbstractRegression]:
-    sensors = (SensorCount(float(len(y)), has_stated_noise=False, has_exact_noise=False),)
+    sensors = (SensorValueCount(float(len(y)), has_stated_noise=False, has_exact_noise=False),)
     active = int((prior.unit_precision == 0).sum())
     primal = PrimalRegression((X.t() @ X)[None], (X.t() @ y)[None], (float(y @ y),), sensors)
     K = stack_groups([group_gram(X, prior, 1, active)], y)

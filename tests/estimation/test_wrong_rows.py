@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.estimation.drift import DriftGroup, DriftSearch, LinearValues
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.regression import SensorValueCount
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 
 NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
@@ -22,7 +22,7 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
     y[15:18] += off * torch.tensor([0.6, 0.8, 0.0]).double()
     noise = torch.tensor([NOISE]).double()
     configuration = torch.arange(CONFIGURATIONS).repeat_interleave(3)
-    counts = (SensorCount(float(count), has_stated_noise=False, has_exact_noise=False),)
+    counts = (SensorValueCount(float(count), has_stated_noise=False, has_exact_noise=False),)
     groups = [DriftGroup("joint 1", torch.tensor([0]), torch.ones(1).double())]
     groups += [DriftGroup("correction", torch.arange(1, count + 1), torch.ones(count).double())]
 

@@ -9,7 +9,12 @@ from testing.closeness import assert_close
 
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
-from pisigma.joint_correction.feature import FeatureOptions, angle_per_joint_value, scaled_joints, unit_inputs
+from pisigma.joint_correction.feature import (
+    FeatureOptions,
+    angle_per_joint_value,
+    product_unit_inputs,
+    scaled_joints,
+)
 from pisigma.joint_correction.fourier_series import (
     BAND_SIZES,
     BAND_STARTS,
@@ -194,7 +199,7 @@ def test_shared_features_are_the_same_for_every_joint(name):
         columns = FEATURES[choice](robot).columns(JointState(q))
         assert_close(columns, columns[:, :1].expand_as(columns))
     assert_close(ScaledJoints(robot).columns(JointState(q))[:, 0], scaled_joints(robot, q))
-    assert_close(SinesCosines(robot).columns(JointState(q))[:, 0], unit_inputs(robot, q))
+    assert_close(SinesCosines(robot).columns(JointState(q))[:, 0], product_unit_inputs(robot, q))
     T = forward_kinematics(robot, q)
     pose = torch.cat([T[:, :3, 3] / robot.reach, zyx_from_rotation(T[:, :3, :3])], -1)
     assert_close(NominalPose(robot).columns(JointState(q))[:, 0], pose, atol=1e-14)
@@ -205,7 +210,9 @@ def test_unit_inputs_are_sines_cosines_and_prismatic_joints():
     q = joints(robot, 5)
     turning = q[:, [0, 1, 3]]
     slide = (q[:, 2:3] - 0.3) / 0.2
-    assert_close(unit_inputs(robot, q), torch.cat([turning.sin(), turning.cos(), slide], -1), atol=1e-14)
+    assert_close(
+        product_unit_inputs(robot, q), torch.cat([turning.sin(), turning.cos(), slide], -1), atol=1e-14
+    )
 
 
 def test_joints_are_scaled_to_their_limits():
@@ -308,7 +315,7 @@ def test_the_correction_agrees_with_its_formula(orders):
     with torch.no_grad():
         for parameter in correction.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
-    phi = unit_inputs(robot, q)
+    phi = product_unit_inputs(robot, q)
     for j in range(robot.dof):
         expected = torch.zeros(6, dtype=torch.float64)
         for chosen, weight in zip(features, correction.linear, strict=True):

@@ -6,7 +6,7 @@ from testing.closeness import assert_close
 from testing.linearised import random_joints
 from torch import Tensor
 
-from pisigma.joint_correction.feature import unit_inputs
+from pisigma.joint_correction.feature import product_unit_inputs
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
@@ -37,7 +37,7 @@ def test_columns_are_products_of_inputs_of_different_joints(name: str) -> None:
     products, q = InputProducts(robot), random_joints(robot, 5, 0)
     turning = [j for j, turns in enumerate(robot.revolute) if turns]
     owner = [*turning, *turning, *(j for j in range(robot.dof) if j not in turning)]
-    phi = unit_inputs(robot, q)
+    phi = product_unit_inputs(robot, q)
     assert products.inputs == len(owner) == phi.shape[-1]
     wanted = [(a, b) for a in range(len(owner)) for b in range(a + 1, len(owner)) if owner[a] != owner[b]]
     assert products.pairs.t().tolist() == [list(pair) for pair in wanted]
@@ -83,7 +83,7 @@ def test_one_unit_is_enough_for_one_product_of_two_sums() -> None:
     r[:, second], s[:, first] = 0.0, 0.0
     a, b = products.pairs
     weights = (r[:, a] * s[:, b] + r[:, b] * s[:, a]).flatten()
-    phi = unit_inputs(robot, q)
+    phi = product_unit_inputs(robot, q)
     assert_close(weighted(products, weights, q), (phi @ r.t()) * (phi @ s.t()), atol=1e-12)
     assert_close(network_of(products, weights)(q), (phi @ r.t()) * (phi @ s.t()), atol=1e-12)
     largest = products.factors(weights).norm(dim=-1).view(6, -1, 2).prod(-1)

@@ -11,10 +11,10 @@ from testing.refusals import numbers_in, refused
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.stored_starts import MAX_STARTS, evenly_spaced_rows, rows_at_starts
+from pisigma.model.stored_starts import MAX_STARTS, count_rows_at_starts, evenly_spaced_rows
 from pisigma.model.training_rows import (
-    known_rows,
     stored_training_rows,
+    training_row_mask,
     training_row_warnings,
     without_known_rows,
 )
@@ -72,9 +72,9 @@ def test_repeated_rows_are_recognised_by_their_readings(made, change, tmp_path):
     save_model(replace(model, training_values=stored_training_rows(model.robot, own)), tmp_path)
     model = load_model(tmp_path)
     again = change(own.select(torch.tensor([7, 3, 5, 30])))
-    assert known_rows(model, again).all()
+    assert training_row_mask(model, again).all()
     mixed = joined(again, change(others))
-    assert known_rows(model, mixed).nonzero()[:, 0].tolist() == [0, 1, 2, 3]
+    assert training_row_mask(model, mixed).nonzero()[:, 0].tolist() == [0, 1, 2, 3]
     new, warnings = without_known_rows(model, mixed)
     assert new.rows == ROWS
     assert len(warnings) == 1
@@ -86,7 +86,7 @@ def test_poses_that_were_measured_again_are_new_rows(made):
     model, own, _ = made
     model = replace(model, training_values=stored_training_rows(model.robot, own))
     later = replace(own, position=own.position + 1e-5 * torch.ones(3))
-    assert not known_rows(model, later).any()
+    assert not training_row_mask(model, later).any()
     assert len(training_row_warnings(model, later)) == 1
 
 
@@ -94,10 +94,10 @@ def test_half_of_many_rows_are_recognised_by_the_stored_ones(made):
     """Of many rows a model stores some, at even spacing."""
     q = torch.rand(3 * MAX_STARTS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     half = q[torch.randperm(len(q), generator=torch.Generator().manual_seed(1))[: len(q) // 2]]
-    assert 200 < rows_at_starts(evenly_spaced_rows(q), half) < 312
+    assert 200 < count_rows_at_starts(evenly_spaced_rows(q), half) < 312
 
 
 def test_rows_that_a_table_rounded_are_recognised(made):
     """Nearly all: a few joint values are at the boundary between rounding up and down."""
     _, own, _ = made
-    assert rows_at_starts(own.q, (own.q * 1e8).round() / 1e8) > 0.9 * ROWS
+    assert count_rows_at_starts(own.q, (own.q * 1e8).round() / 1e8) > 0.9 * ROWS

@@ -11,7 +11,7 @@ from testing.refusals import refused
 from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.planning.task import TASK_POSES, task_poses
+from pisigma.planning.task import TASK_POSES, task_joint_values
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import zyx_from_rotation
@@ -38,13 +38,13 @@ def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, kind: str):
     (tmp_path / "task.csv").write_text("\n".join(rows))
     arm, settings = ArmInSurroundings.from_robot(robot), PlanSettings(task=str(tmp_path / "task.csv"))
     with no_type_checker():
-        read = task_poses(arm, settings, q)
+        read = task_joint_values(arm, settings, q)
     assert_close(forward_kinematics(robot, read), T, atol=1e-9)
     (tmp_path / "task.csv").write_text(
         "\n".join(rows).replace(",", ",99", 3) if kind == "poses" else "q1_deg\n1"
     )
     with refused(PisigmaError, file="task.csv"), no_type_checker():
-        task_poses(arm, settings, q)
+        task_joint_values(arm, settings, q)
 
 
 @pytest.mark.parametrize(
@@ -61,13 +61,13 @@ def test_joint_values_of_a_task_outside_the_limits_are_refused(
         PlanSettings(task=str(tmp_path / "task.csv")),
     )
     with refused(PlanningError, file="task.csv", line=3) as caught, no_type_checker():
-        task_poses(arm, settings, torch.zeros(1, 6, dtype=torch.float64))
+        task_joint_values(arm, settings, torch.zeros(1, 6, dtype=torch.float64))
     assert caught.value.value == arm.robot.axes[2].name
     assert stated in str(caught.value)
 
 
 def test_without_a_task_the_whole_workspace_is_used():
     q = torch.arange(4000.0, dtype=torch.float64).reshape(1000, 4)
-    some = task_poses(ArmInSurroundings.from_robot(Robot.load("kiro3")), PlanSettings(), q)
+    some = task_joint_values(ArmInSurroundings.from_robot(Robot.load("kiro3")), PlanSettings(), q)
     assert len(some) == TASK_POSES
     assert_close(some[[0, -1]], q[[0, -1]])

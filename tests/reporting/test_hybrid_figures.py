@@ -21,7 +21,7 @@ from pisigma.reporting.calibration_tables import (
     trial_table,
 )
 from pisigma.validation.held_out.calibration_summary import TrialFigures, summarise
-from pisigma.validation.held_out.pose_statistics import PredictedSpread
+from pisigma.validation.held_out.pose_statistics import ErrorsWithPredictedSigma
 from pisigma.validation.held_out.validation_figures import ErrorFigures, LearningPoint
 
 
@@ -60,12 +60,12 @@ def test_predicted_deviations_near_and_far_apart(tmp_path, generator, far):
     sigma = 1e-5 * (1 + far * torch.rand(200, 3, generator=generator, dtype=torch.float64))
     error = sigma * torch.randn(200, 3, generator=generator, dtype=torch.float64)
     error[3] = torch.nan
-    draw_spread(PredictedSpread(error, sigma), tmp_path / "spread.png")
+    draw_spread(ErrorsWithPredictedSigma(error, sigma), tmp_path / "spread.png")
     assert ink(tmp_path / "spread.png") > 0.02
 
 
 def test_one_value_can_be_drawn(tmp_path):
-    one = PredictedSpread.all_nan(1)
+    one = ErrorsWithPredictedSigma.all_nan(1)
     one.error[0, 0], one.sigma[0, 0] = 1e-5, 2e-5
     draw_spread(one, tmp_path / "spread.png")
     assert one.coverage == 1.0

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, LinearisedRows
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import Posterior, SensorCount
+from pisigma.estimation.regression import Posterior, SensorValueCount
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class DenseRegression(AbstractDesignRegression):
     y: Tensor
     sensor: Tensor
     group: Tensor
-    sensors: tuple[SensorCount, ...]
+    sensors: tuple[SensorValueCount, ...]
 
     @staticmethod
-    def from_rows(design: Design, rows: Rows) -> "DenseRegression":
+    def from_rows(design: Design, rows: LinearisedRows) -> "DenseRegression":
         """Return the regression of all weighted rows of all sensors."""
         parts = []
         for number, values in enumerate(rows.values):
@@ -55,7 +55,7 @@ class DenseRegression(AbstractDesignRegression):
         sensor = torch.arange(len(y)).repeat_interleave(torch.tensor([len(values) for values in y]))
         none = (False,) * len(y)
         flags = zip(y, known.get("stated", none), known.get("exact", none), strict=True)
-        counts = tuple(SensorCount(float(len(values)), stated, exact) for values, stated, exact in flags)
+        counts = tuple(SensorValueCount(float(len(values)), stated, exact) for values, stated, exact in flags)
         return DenseRegression(
             torch.cat(list(X)), torch.cat(list(y)), sensor, torch.arange(len(sensor)), counts
         )

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup
-from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.design import Design, LinearisedRows
 from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import FeatureFit
 from pisigma.calibration.hybrid.sensor_values import sensor_values
@@ -81,7 +81,7 @@ class LinearisedArm:
     """The rows of a geometric calibration, linearised at its solution."""
 
     setup: CalibrationSetup
-    rows: Rows
+    rows: LinearisedRows
     noise: tuple[float, ...]
     prior_scale: tuple[float, ...]
 
@@ -98,11 +98,11 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
     """Calibrate the geometry by unweighted least squares, and linearise at the solution."""
     solved = GeometricCalibrator(robot, loss=SquaredLoss(), **options).solve(measurements)  # type: ignore[arg-type]
     here, problem = solved.solution.linearisation, solved.problem
-    view = sensor_view_of(here)
+    view = contributions_and_noise_of(here)
     values, design = sensor_values(problem, here.point), Design(problem, ())
     weights = [torch.ones_like(sensor.weight_root) for sensor in values]
     x, group = (here.point - problem.prior_mean)[problem.active], held_out_groups(solved.setup.measurements)
-    rows = Rows.from_linearisation(design, x, values, weights, group)
+    rows = LinearisedRows.from_linearisation(design, x, values, weights, group)
     return LinearisedArm(solved.setup, rows, tuple(view.noise.tolist()), tuple(view.prior_scale.tolist()))
 
 

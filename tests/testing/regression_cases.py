@@ -10,7 +10,7 @@ from testing.linearised import LinearisedArm, linearised, random_joints, tracker
 from testing.sensors import mixed_data, true_robot
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.design import Design, LinearisedRows
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
@@ -37,7 +37,7 @@ class RegressionCase:
 
     design: Design
     smaller: tuple[AbstractFeature, ...]
-    rows: Rows
+    rows: LinearisedRows
     prior: GaussianPrior
     noise: tuple[float, ...]
     exactness: float

@@ -10,7 +10,7 @@ from testing.simulated_arm import simulate
 
 import pisigma
 from pisigma.files.errors import IdentificationError, MeasurementError
-from pisigma.measurement.sensors.socket import matching_sockets
+from pisigma.measurement.sensors.socket import expand_socket_names
 from pisigma.model.folder.model_folder import load_model
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.workflow.calibrate import calibrator_of
@@ -105,7 +105,7 @@ def test_a_prior_that_is_not_a_number_is_refused():
 def distances(*stated: str) -> dict[tuple[str, str], float]:
     """Known distances of the calibrator, as the command line states them."""
     settings = CalibrationSettings(model="geometric", socket_distances=parse_socket_distances(stated))
-    matching = matching_sockets(settings.socket_distances, SOCKETS)
+    matching = expand_socket_names(settings.socket_distances, SOCKETS)
     return calibrator_of(settings, pisigma.Robot.load("panda"), matching).socket_distances
 
 
@@ -115,9 +115,9 @@ def test_distances_of_one_plate_share_their_error(others):
     plate = {("*/0", "*/1"): 0.05}
     single = {("left/0", "right/1"): 0.4} if others else {}
     settings = CalibrationSettings(socket_distances=plate | single, socket_sigma=1e-4)
-    matching = matching_sockets(settings.socket_distances, SOCKETS)
+    matching = expand_socket_names(settings.socket_distances, SOCKETS)
     calibrator = calibrator_of(settings, pisigma.Robot.load("panda"), matching).geometric_calibrator
-    assert calibrator.socket_sigma / len(matching_sockets(plate, SOCKETS)) ** 0.5 == pytest.approx(1e-4)
+    assert calibrator.socket_sigma / len(expand_socket_names(plate, SOCKETS)) ** 0.5 == pytest.approx(1e-4)
 
 
 def test_known_distances_between_sockets():

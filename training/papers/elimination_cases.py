@@ -10,7 +10,7 @@ import numpy as np
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
@@ -79,7 +79,7 @@ def calibrate_without(
     for name in removed:
         if name not in arm:
             raise RecipeError(
-                f"there is no parameter '{name}' of the arm to eliminate; {nearest_choice(name, arm)}",
+                f"there is no parameter '{name}' of the arm to eliminate; {choice_remedy(name, arm)}",
                 option="cases",
                 value=name,
             )

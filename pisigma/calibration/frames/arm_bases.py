@@ -16,8 +16,8 @@ from pisigma.calibration.frames.initial_bases import (
     shared_object_in_base,
 )
 from pisigma.calibration.frames.shared_joints import (
+    arms_sharing_most_joints,
     axis_difference,
-    most_shared_joints,
     shared_joint_count,
     with_common_joints,
     with_values,
@@ -165,7 +165,7 @@ class ArmBases:
 
     def reference_arm(self, arm_index: int) -> int:
         """Return the index of the arm whose base and shared joints an arm has."""
-        while (before := most_shared_joints(self.arms)[arm_index][0]) != arm_index:
+        while (before := arms_sharing_most_joints(self.arms)[arm_index][0]) != arm_index:
             arm_index = before
         return arm_index
 
@@ -176,7 +176,7 @@ class ArmBases:
         parts = zip(
             torch.split(self.conditioned.z, sizes),
             torch.split(self.conditioned.z_root, sizes),
-            most_shared_joints(self.arms),
+            arms_sharing_most_joints(self.arms),
             strict=True,
         )
         arms: list[ArmPosterior] = []

@@ -17,7 +17,7 @@ from pisigma.calibration.geometric.identifiability.observability import directio
 from pisigma.calibration.geometric.identifiability.sufficiency import floating_frames
 from pisigma.calibration.geometric.problem.held_directions import LARGEST_DEVIATION, HeldDirections
 from pisigma.calibration.geometric.problem.least_squares import SolutionStatus, levenberg_marquardt
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.parameters import Parameter, ParameterSpace
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
@@ -184,8 +184,8 @@ def fit_frames(
     robot: Robot,
     rows: Measurements,
     frame_choice: FrameChoice,
-    bases: Frames = _NO_FRAMES,
-    tools: Frames = _NO_FRAMES,
+    previous_bases: Frames = _NO_FRAMES,
+    previous_tools: Frames = _NO_FRAMES,
 ) -> FrameFit:
     """Fit base, tool or both by least squares, leaving out rows that all others contradict.
 
@@ -197,20 +197,20 @@ def fit_frames(
         robot: robot with the fixed arm, and with the base or tool that is not fitted.
         rows: touches, positions, poses or images; sockets are points at unknown positions.
         frame_choice: what to fit; the tool's orientation only if rows have orientations.
-        bases: bases of named frames that differ from the base of the robot.
-        tools: tools of named targets that differ from the tool of the robot.
+        previous_bases: bases of named frames that differ from the base of the robot.
+        previous_tools: tools of named targets that differ from the tool of the robot.
 
     Raises:
         IdentificationError: there are too few rows, several frames or targets whose known base or tool is not stated,
             or a base without rows at stated positions.
         PoseError: the joint values do not fit the robot.
     """
-    bases = {name: bases[name] for name in set(rows.frame) & set(bases)}
+    previous_bases = {name: previous_bases[name] for name in set(rows.frame) & set(previous_bases)}
     if frame_choice == "tool":
-        _refuse_several("frame", set(rows.frame), bases, rows)
+        _refuse_several("frame", set(rows.frame), previous_bases, rows)
     if frame_choice == "base":
         _refuse_several("target", set(rows.target), {}, rows)
-        robot = robot.with_geometry(tool=tools.get(rows.target[0], robot.tool))
+        robot = robot.with_geometry(tool=previous_tools.get(rows.target[0], robot.tool))
     turned = bool({"pose", "rotation"} & set(rows.kinds))
     calibrator = GeometricCalibrator(
         robot,
@@ -220,7 +220,9 @@ def fit_frames(
         elimination="none",
         prior=None,
         loss=SquaredLoss(),
-        base_guesses={name: tuple(base) for name, base in bases.items()} if frame_choice == "tool" else {},
+        base_guesses={name: tuple(base) for name, base in previous_bases.items()}
+        if frame_choice == "tool"
+        else {},
     )
     used, wrong = list(range(rows.rows)), list[int]()
     while True:
@@ -234,8 +236,8 @@ def fit_frames(
                 remedy=f"measure positions or poses{f' in frame {floating[0]}' if floating[0] else ''}, or fit the "
                 "tool only (--only tool)",
             )
-        solved = hold_undetermined(free, _frames(free), bases, tools)
-        fit = FrameFit(frame_choice, solved, rows, tuple(used), tuple(wrong), bases, tools)
+        solved = hold_undetermined(free, _frames(free), previous_bases, previous_tools)
+        fit = FrameFit(frame_choice, solved, rows, tuple(used), tuple(wrong), previous_bases, previous_tools)
         if (number := _wrong_row(fit)) is None:
             return fit
         used.remove(number)
@@ -279,7 +281,10 @@ def _wrong_row(fit: FrameFit) -> int | None:
 
 
 def hold_undetermined(
-    solved: SolvedCalibration, frames: Sequence[int], bases: Frames, tools: Frames
+    solved: SolvedCalibration,
+    coordinate_indices: Sequence[int],
+    previous_bases: Frames,
+    previous_tools: Frames,
 ) -> SolvedCalibration:
     """Fit again, with all directions that the rows do not determine held at their previous values.
 
@@ -289,23 +294,23 @@ def hold_undetermined(
 
     Args:
         solved: fit in which all coordinates were free.
-        frames: indices of the coordinates of bases and tools.
-        bases: previous bases by frame; other frames use the base of the robot.
-        tools: previous tools by target; other targets use the tool of the robot.
+        coordinate_indices: indices of the coordinates of bases and tools.
+        previous_bases: previous bases by frame; other frames use the base of the robot.
+        previous_tools: previous tools by target; other targets use the tool of the robot.
 
     Returns:
         The fit; `problem.held_directions` contains the held directions, if any.
     """
-    found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
+    found, space = FrameDirections.at_solution(solved, coordinate_indices), solved.problem.space
     unknown = int(torch.isinf(found.sigma).sum())
-    before, rows = initial_parameters(space, bases, tools), solved.problem.rows
+    before, rows = initial_parameters(space, previous_bases, previous_tools), solved.problem.rows
     distance = found.distances(solved, before).abs()
     plausible = distance <= _IMPROBABLE * found.sigma + rows * found.sigma**2 / _LEVER
     # The least determined directions come first, so once one is not held, none of the following are.
     weak = int(((found.sigma * rows**0.5 > _LARGEST_SPREAD) & plausible).cumprod(0).sum())
     deviation = found.sigma.hypot(distance)
     for count in range(weak, 0, -1):
-        held = _with_held(solved, frames, deviation[:count], before)
+        held = _with_held(solved, coordinate_indices, deviation[:count], before)
         if count <= unknown or not _contradicts(held, solved):
             return held
     return solved
@@ -343,13 +348,16 @@ def _with_held(
 
 def _contradicts(held: SolvedCalibration, free: SolvedCalibration) -> bool:
     """Return whether the residuals are much larger with directions held than with all directions free."""
-    variances = sensor_view_of(free.refined_linearisation).variances
+    variances = contributions_and_noise_of(free.refined_linearisation).variances
     squares = [
         float(
             (
                 torch.stack([part.residual_length.square().sum() for part in view.contributions]) / variances
             ).sum()
         )
-        for view in (sensor_view_of(held.solution.linearisation), sensor_view_of(free.solution.linearisation))
+        for view in (
+            contributions_and_noise_of(held.solution.linearisation),
+            contributions_and_noise_of(free.solution.linearisation),
+        )
     ]
     return held.solution.status != SolutionStatus.EXACT and squares[0] > _CONTRADICTED**2 * squares[1]

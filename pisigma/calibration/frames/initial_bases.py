@@ -20,27 +20,27 @@ rotation."""
 
 
 def shared_object_in_base(
-    arm: ArmPosterior, key: tuple[str, str], values: Callable[[Sequence[int]], Tensor]
+    arm: ArmPosterior, key: tuple[str, str], values_at: Callable[[Sequence[int]], Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Return the pose of a shared object in the base of an arm, and the other unknowns of its sensor."""
     frame, rows = arm.shared_objects[key]
     if key[0] == JOINT:
-        return frame_after_rows(values(rows)), values(())
-    T_base_frame = invert(transform_from_xyz_zyx(values(arm.base_rows(frame))))
+        return frame_after_rows(values_at(rows)), values_at(())
+    T_base_frame = invert(transform_from_xyz_zyx(values_at(arm.base_rows(frame))))
     if key[0] == "frame":
-        return T_base_frame, values(())
-    point = transform(torch.eye(3, dtype=torch.float64), values(rows[:3]))
-    return T_base_frame @ point, values(rows[3:])
+        return T_base_frame, values_at(())
+    point = transform(torch.eye(3, dtype=torch.float64), values_at(rows[:3]))
+    return T_base_frame @ point, values_at(rows[3:])
 
 
 def fitted_pose(
     arms: Sequence[ArmPosterior],
-    number: int,
+    arm_index: int,
     shared_object: SharedObject,
     tips: Sequence[TipPositions | None],
 ) -> Float64[Tensor, "4 4"]:
     """Return the pose of a shared object in the base of an arm, according to the fit of this arm."""
-    arm, touched = arms[number], tips[number]
+    arm, touched = arms[arm_index], tips[arm_index]
     if shared_object.kind == TOUCH:
         assert arm.touches is not None
         assert touched is not None

@@ -10,9 +10,9 @@ from pisigma.calibration.frames.arm_uncertainty import ArmUncertainty
 from pisigma.calibration.frames.frame_fit import FrameFit
 from pisigma.calibration.frames.whitened_values import WhitenedValues
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.sensor_values import joint_columns
+from pisigma.calibration.hybrid.sensor_values import joint_value_parameters
 from pisigma.estimation.alternatives import Cause, FitResiduals
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS
@@ -82,7 +82,7 @@ def _residuals(
     X_arm, X_frames, X_unknowns = torch.split(values.X, [len(arm), len(frames), len(unknowns)], 1)
     moved = solved.solution.linearisation.point[unknowns] - setup.start[unknowns]
     unit = _noise_units(solved, values)
-    zeros = X_arm[:, joint_columns(space)]
+    zeros = X_arm[:, joint_value_parameters(space)]
     causes = {"arm": _UNIT * X_arm, "joint zeros": _UNIT * zeros, "joint noise": _UNIT * _per_row(values)}
     groups = [space.parameters[index].group for index in unknowns]
     for kind in ("camera", "board"):
@@ -98,7 +98,7 @@ def _residuals(
         fitted_columns=unit[:, None] * X_frames,
         stated_covariance_root=unit[:, None] * known,
         has_exact_noise=values.has_exact_noise,
-        is_stated=bool(rows.is_measured("corner").any()),
+        has_stated_noise=bool(rows.is_measured("corner").any()),
         causes={name: unit[:, None] * Z for name, Z in causes.items()},
     )
 
@@ -112,7 +112,7 @@ def _usual_error(kind: str, name: str) -> float:
 
 def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[Tensor, " values"]:
     """Return the factors that undo the estimated noise in rows that state their own noise (corners of images)."""
-    deviation = sensor_view_of(solved.refined_linearisation).variances.sqrt()
+    deviation = contributions_and_noise_of(solved.refined_linearisation).variances.sqrt()
     noise = solved.setup.measurements.readings.get("corner_noise")
     factors = []
     for (one, _), sigma in zip(values.sensors, deviation, strict=True):

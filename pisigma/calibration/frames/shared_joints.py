@@ -52,7 +52,7 @@ def with_common_joints(
     arm: ArmPosterior,
     reference: ArmPosterior,
     T_first_base: tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]],
-    step_roots: tuple[Float64[Tensor, "6 directions"], Float64[Tensor, "6 directions"]],
+    base_covariance_roots: tuple[Float64[Tensor, "6 directions"], Float64[Tensor, "6 directions"]],
     count: int,
 ) -> ArmPosterior:
     """Return an arm with the base and the shared rows of another arm, and with unchanged poses of its tool.
@@ -64,7 +64,7 @@ def with_common_joints(
         arm: the arm, conditioned on equal axes of the shared joints.
         reference: the arm whose values are taken, conditioned in the same directions.
         T_first_base: bases of the arm and of the reference, in the base of the first arm.
-        step_roots: roots of the covariance of both bases, see `ArmBases.covariance_root`.
+        base_covariance_roots: roots of the covariance of both bases, see `ArmBases.covariance_root`.
         count: number of shared joints.
     """
     shared, own = 5 * (count - 1), len(arm.space.parameters)
@@ -91,7 +91,7 @@ def with_common_joints(
         )
 
     at = torch.cat([reference.values[:shared], arm.values, torch.zeros(12).to(arm.values)])
-    roots = torch.cat([reference.covariance_root[:shared], arm.covariance_root[:own], *step_roots])
+    roots = torch.cat([reference.covariance_root[:shared], arm.covariance_root[:own], *base_covariance_roots])
     return with_values(
         arm, combined(at), torch.cat([torch.func.jacrev(combined)(at) @ roots, arm.covariance_root[own:]])
     )
@@ -131,7 +131,7 @@ def shared_joint_count(arm: ArmPosterior, other: ArmPosterior) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def most_shared_joints(arms: Sequence[ArmPosterior]) -> list[tuple[int, int]]:
+def arms_sharing_most_joints(arms: Sequence[ArmPosterior]) -> list[tuple[int, int]]:
     """Return, for every arm, the earlier arm with which it shares most joints and the number of these joints.
 
     An arm that shares no joint with an earlier one is its own reference, with 0 joints.

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.estimation.cholesky import orthonormal_columns
@@ -48,7 +48,7 @@ class WhitenedValues:
             parameters: indices of the parameters with respect to which to differentiate.
         """
         problem, here = solved.problem.with_active(list(parameters)), solved.refined_linearisation
-        deviation = sensor_view_of(here).variances.sqrt()
+        deviation = contributions_and_noise_of(here).variances.sqrt()
         scaled = [
             (one, one.weight_root / float(sigma))
             for one, sigma in zip(sensor_values(problem, here.point), deviation, strict=True)
@@ -106,16 +106,16 @@ class FrameDirections:
     sigma: Float64[Tensor, " frames"]
 
     @staticmethod
-    def at_solution(solved: SolvedCalibration, frames: Sequence[int]) -> "FrameDirections":
+    def at_solution(solved: SolvedCalibration, coordinate_indices: Sequence[int]) -> "FrameDirections":
         """Return the directions at a solution, with the noise estimated from its residuals.
 
         Args:
             solved: the solution.
-            frames: indices of the coordinates; the other free parameters are eliminated.
+            coordinate_indices: indices of the coordinates; the other free parameters are eliminated.
         """
         active = solved.problem.active.tolist()
         X = WhitenedValues.at_solution(solved, active).X * solved.problem.step_scale
-        ours = torch.tensor([index in set(frames) for index in active])
+        ours = torch.tensor([index in set(coordinate_indices) for index in active])
         U, own = orthonormal_columns(X[:, ~ours]), X[:, ours]
         own = own - U @ (U.t() @ own)
         information, vectors = torch.linalg.eigh(own.t() @ own)

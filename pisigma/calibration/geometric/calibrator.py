@@ -28,7 +28,7 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_c
 from pisigma.calibration.geometric.problem.information import information
 from pisigma.calibration.geometric.problem.joint_repeatability import joint_scatter_factor
 from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import (
@@ -155,11 +155,11 @@ class GeometricCalibrator:
         start = rough.linearisation
         if (
             findings.added_parameters
-            or len(sensor_view_of(start).contributions[0].residual_length) < problem.rows
+            or len(contributions_and_noise_of(start).contributions[0].residual_length) < problem.rows
         ):
             start = problem.linearise(start.point, start)
         else:
-            start = problem.combine_contributions(start.point, sensor_view_of(start))
+            start = problem.combine_contributions(start.point, contributions_and_noise_of(start))
         left = self.maximum_iterations - rough.iterations
         fine = levenberg_marquardt(problem, start, left, step_tolerance=SHORTEST_STEP)
         if setup.joint_repeatability:
@@ -298,7 +298,7 @@ class GeometricCalibrator:
         most = problem.space.max_identifiable(problem.needs_rotation)
         if self.elimination != "exact" or not others or len(kept) >= most:
             return rough, findings, active
-        now = information(problem, here.point, unknowns + kept + others, sensor_view_of(here))
+        now = information(problem, here.point, unknowns + kept + others, contributions_and_noise_of(here))
         columns = additional_columns(without_sensor_unknowns(setup, now), len(kept))
         extended = [(kept + others)[i] for i in columns]
         return rough, replace(findings, added_parameters=extended), [*active, *extended]

@@ -37,7 +37,7 @@ def outliers_of(
     measurements: Measurements,
     sensor: AbstractSensor,
     rows: Int64[Tensor, " values"],
-    length: Float64[Tensor, " values"],
+    residual_length: Float64[Tensor, " values"],
     residual_in_sigmas: Float64[Tensor, " values"],
     weight: Float64[Tensor, " values"],
 ) -> list[Outlier]:
@@ -48,7 +48,7 @@ def outliers_of(
         measurements: measurements from which the setup was made.
         sensor: the sensor.
         rows: indices of the rows in the problem.
-        length: lengths of the residuals of these rows [m or rad].
+        residual_length: lengths of the residuals of these rows [m or rad].
         residual_in_sigmas: length of the residual in standard deviations of one value.
         weight: weights of the rows.
     """
@@ -57,6 +57,8 @@ def outliers_of(
         row = int(setup.row_indices[rows[k]])
         where = measurements.place(row)
         outliers.append(
-            Outlier(row, where, sensor.name, float(length[k]), float(residual_in_sigmas[k]), sensor.unit)
+            Outlier(
+                row, where, sensor.name, float(residual_length[k]), float(residual_in_sigmas[k]), sensor.unit
+            )
         )
     return outliers

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.identifiability.redundancy import RankFindings, Redundancy
 from pisigma.calibration.geometric.problem.least_squares import Linearisation, covariance_of
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.prior_scales import LENGTH_GROUPS, PriorGroup, effective_parameters
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import (
@@ -62,7 +62,7 @@ def prior_ratios_of(
         problem: the problem with its free parameters.
         linearisation: the problem linearised at its solution.
     """
-    view = sensor_view_of(linearisation)
+    view = contributions_and_noise_of(linearisation)
     precision, group = problem.precision[problem.active], problem.prior_group
     effective = effective_parameters(
         precision, group, view.prior_scale, covariance_of(linearisation.normal)
@@ -225,7 +225,7 @@ def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
 def _prior_precision(problem: CalibrationProblem, linearisation: Linearisation[Tensor]) -> np.ndarray:
     """Return the prior precision (1 / variance) of all parameters; 0 for parameters that are not free."""
     full = torch.zeros_like(problem.precision)
-    full[problem.active] = sensor_view_of(linearisation).scaled_precision(
+    full[problem.active] = contributions_and_noise_of(linearisation).scaled_precision(
         problem.precision[problem.active], problem.prior_group
     )
     precision: np.ndarray = full.cpu().numpy()

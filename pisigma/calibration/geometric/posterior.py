@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import Parameter, ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, choice_remedy
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class ParameterPosterior:
         for name in names:
             if name not in number:
                 raise IdentificationError(
-                    f"there is no parameter '{name}'", value=name, remedy=nearest_choice(name, self.names)
+                    f"there is no parameter '{name}'", value=name, remedy=choice_remedy(name, self.names)
                 )
         rows = [number[name] for name in names]
         return ParameterPosterior(

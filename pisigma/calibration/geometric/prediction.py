@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -50,7 +50,7 @@ def _of_rows(
                 f"{what} '{name}' was not calibrated",
                 value=name,
                 at=measurements.place_of(row, what),
-                remedy=nearest_choice(name, order),
+                remedy=choice_remedy(name, order),
             )
     T = transform_from_xyz_zyx(torch.from_numpy(np.stack([frames[name] for name in order])))
     index = torch.tensor([order.index(name) for name in names], dtype=torch.int64)

@@ -36,7 +36,10 @@ from pisigma.calibration.geometric.problem.least_squares import (
     SolutionStatus,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.noise import effective_parameters_by_sensor, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import (
+    contributions_and_noise_of,
+    effective_parameters_by_sensor,
+)
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -223,7 +226,8 @@ class CalibrationResult:
         """Indices O1 to O5 of the free parameters at the solution."""
         problem, here = self.solved.problem, self.solved.refined_linearisation
         gram = sum(
-            (part.normal for part in sensor_view_of(here).contributions), torch.zeros_like(here.normal)
+            (part.normal for part in contributions_and_noise_of(here).contributions),
+            torch.zeros_like(here.normal),
         )
         usual = problem.step_scale * 1e3  # converted to rows in mm and mrad, and columns per 1 mm and 1 mrad
         poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
@@ -316,7 +320,7 @@ class CalibrationResult:
 
 def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
     """Return warnings about angles that disagree with lengths, and about frames that do not fit."""
-    disagreement = float(sensor_view_of(solved.refined_linearisation).angle_variance_factor.max())
+    disagreement = float(contributions_and_noise_of(solved.refined_linearisation).angle_variance_factor.max())
     warnings = []
     if disagreement > _DISAGREEING:
         sentence = (
@@ -334,7 +338,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
     R = setup.reference_frames.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
     for sensor, part in zip(
-        problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
+        problem.sensors, contributions_and_noise_of(solved.refined_linearisation).contributions, strict=True
     ):
         own = part.residual.t()
         if sensor.components == 3:
@@ -347,7 +351,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
 
 def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
-    view = sensor_view_of(solved.refined_linearisation)
+    view = contributions_and_noise_of(solved.refined_linearisation)
     for number, (sensor, part) in enumerate(zip(solved.problem.sensors, view.contributions, strict=True)):
         deviations = part.residual_length / view.scales[number]
         weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
@@ -361,7 +365,7 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
 def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     noise = []
     problem, here = solved.problem, solved.refined_linearisation
-    view = sensor_view_of(here)
+    view = contributions_and_noise_of(here)
     used = effective_parameters_by_sensor(view, covariance_of(here.normal)).tolist()
     for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
         if sensor.is_stated:

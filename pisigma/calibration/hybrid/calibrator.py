@@ -10,13 +10,13 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
-from pisigma.calibration.geometric.problem.noise import renumber, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of, renumber
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.arm import JointCoverage
 from pisigma.calibration.hybrid.delivery import FinalCorrection, choose_final_correction
-from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
+from pisigma.calibration.hybrid.design import Design, LinearisedRows, robust_weights
 from pisigma.calibration.hybrid.gravity import (
     USUAL,
     gravity_by_evidence,
@@ -189,7 +189,7 @@ class HybridCalibrator:
         If gravity seems to act in a direction other than down, both directions are tried, because torques along
         other axes may imitate products.
         """
-        problem, view = solved.problem, sensor_view_of(solved.solution.linearisation)
+        problem, view = solved.problem, contributions_and_noise_of(solved.solution.linearisation)
         noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
         if problem.q.shape[0] > SEARCHED_ROWS:
             chosen = randomly_chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
@@ -204,7 +204,7 @@ class HybridCalibrator:
             ((distance < _GROSS) | one.is_stated).to(distance)
             for distance, one in zip(distances, values, strict=True)
         ]
-        rows = Rows.from_linearisation(
+        rows = LinearisedRows.from_linearisation(
             design, (point - problem.prior_mean)[problem.active], values, weights, group
         )
         pairs = zip(noise, values, strict=True)
@@ -231,7 +231,7 @@ class HybridCalibrator:
             choices.append(search.try_derived_feature(best, GearLines(robot, orders) if odds else None, odds))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
-    def _lines(self, rows: Rows, best: FeatureFit) -> tuple[tuple[int, ...], ...]:
+    def _lines(self, rows: LinearisedRows, best: FeatureFit) -> tuple[tuple[int, ...], ...]:
         """Return the orders of spectral lines in the residuals of a fit, beyond the harmonics of its series."""
         if "lines" not in self.features:
             return ()

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
+from pisigma.calibration.hybrid.design import Design, LinearisedRows, robust_weights
 from pisigma.calibration.hybrid.refinement import (
     CONVERGENCE_TOLERANCE,
     MAX_LINEARISATIONS,
@@ -22,7 +22,7 @@ from pisigma.calibration.hybrid.refinement import (
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGH_TOLERANCE, FeatureChoice, FeatureFit
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
-from pisigma.estimation.held_out import standard_errors
+from pisigma.estimation.held_out import sum_in_standard_errors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
@@ -71,7 +71,7 @@ class SensorErrors:
         return Comparison(
             _ratio(fitted[0], fitted[1]),
             _ratio(squares[0].sum(), squares[1].sum()),
-            standard_errors(gain[torch.unique(self.group[judged])]),
+            sum_in_standard_errors(gain[torch.unique(self.group[judged])]),
         )
 
 
@@ -100,7 +100,7 @@ def held_out_row_errors(
     posterior: Posterior,
     group: Int64[Tensor, " rows"],
     folds: Sequence[Int64[Tensor, " _groups"]],
-    update_count: int = 0,
+    noise_update_count: int = 0,
 ) -> tuple[SensorErrors | None, ...]:
     """Leave out every fold, and predict its rows with an exact fit to the other folds.
 
@@ -112,24 +112,26 @@ def held_out_row_errors(
         posterior: posterior from all rows.
         group: see `Rows.group`.
         folds: groups that are held out together.
-        update_count: number of updates of noise and prior scales for every fold.
+        noise_update_count: number of updates of noise and prior scales for every fold.
 
     Returns:
         Errors per sensor; None for sensors whose values are given.
     """
     values = _values(design, posterior.x)
     weights = robust_weights(design.problem, values, posterior.effective_unknowns)
-    rows = Rows.from_linearisation(design, posterior.x, values, weights, group)
+    rows = LinearisedRows.from_linearisation(design, posterior.x, values, weights, group)
     fit = build_regression(design, rows)
     held_out = [torch.full_like(one.weight_root, torch.nan) for one in values]
     for groups in folds:
         held = torch.isin(group, groups.to(group.device))
         others = torch.unique(group[~held])
-        rest = fit.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, update_count)
+        rest = fit.without_groups(groups).maximise_evidence(
+            posterior.prior, posterior.noise, noise_update_count
+        )
         here, x = rows, rest.x
         for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
-            there = Rows.from_linearisation(design, x, seen, weights, group)
+            there = LinearisedRows.from_linearisation(design, x, seen, weights, group)
             differs = there.select_groups(others).squared_difference(
                 here.select_groups(others), x, design, rest.noise
             )
@@ -263,7 +265,7 @@ def _compared(errors: Errors, before: Errors) -> list[Comparison]:
 def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Posterior:
     """Return the posterior of the geometric calibration given the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
-    design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
+    design, view = Design(problem, ()), contributions_and_noise_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.prior_mean)[problem.active]
     rows = linearise_rows(design, x, choice.geometry.posterior.effective_unknowns, group)
     prior = design.prior(view.prior_scale.tolist())

@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.estimation.prior import FIRST_SIZE, GaussianPrior
-from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
+from pisigma.estimation.regression import AbstractRegression, Posterior, SensorValueCount
 from pisigma.files.errors import IdentificationError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
@@ -131,10 +131,10 @@ class Design:
                     sizes[start + number] = prior.sizes[first + min(number, count - 1)]
         return replace(prior_here, sizes=sizes)
 
-    def first_scale_indices(self, class_count: int) -> list[int]:
+    def first_scale_indices(self, geometric_class_count: int) -> list[int]:
         """Return the index of the first prior scale of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
-        return [class_count + sum(counts[:k]) for k in range(len(counts))]
+        return [geometric_class_count + sum(counts[:k]) for k in range(len(counts))]
 
     def indices(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
         """Return the indices of the unknowns of a design that has a subset of the features.
@@ -152,7 +152,7 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class LinearisedRows:
     """Linearised rows of all sensors.
 
     Attributes:
@@ -174,10 +174,10 @@ class Rows:
         return int(self.group.max()) + 1
 
     @property
-    def sensors(self) -> tuple[SensorCount, ...]:
+    def sensors(self) -> tuple[SensorValueCount, ...]:
         """Number of values of every sensor."""
         return tuple(
-            SensorCount(
+            SensorValueCount(
                 sensor.residual.numel() / sensor.repeat_variance_factor,
                 sensor.has_stated_noise,
                 sensor.is_stated,
@@ -186,14 +186,14 @@ class Rows:
             for sensor in self.values
         )
 
-    def select_groups(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+    def select_groups(self, groups: Int64[Tensor, " chosen"]) -> "LinearisedRows":
         """Return the rows of the given groups."""
         mask = torch.zeros(self.groups, dtype=torch.bool, device=self.group.device)
         mask[groups.to(mask.device)] = True
         kept = tuple(sensor.select(mask[self.group[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
 
-    def held_out_rows(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+    def held_out_rows(self, groups: Int64[Tensor, " chosen"]) -> "LinearisedRows":
         """Return the rows of the given groups, without sensors whose values are given."""
         rows = self.select_groups(groups)
         kept = [sensor.select(slice(0, 0)) if sensor.is_stated else sensor for sensor in rows.values]
@@ -217,7 +217,7 @@ class Rows:
         values: Sequence[SensorValues],
         weights: Sequence[Float64[Tensor, " _values"]],
         group: Int64[Tensor, " rows"],
-    ) -> "Rows":
+    ) -> "LinearisedRows":
         """Return rows from values that were linearised at given unknowns; repeats of a pose become one row.
 
         Args:
@@ -237,10 +237,10 @@ class Rows:
             if problem.configuration is not None:
                 one = one.downweight_correlated(problem.configuration)
             rows.append(replace(one, residual=one.residual + design.predicted_change(one, x)))
-        return Rows(problem, tuple(rows), group, frozenset(rejected))
+        return LinearisedRows(problem, tuple(rows), group, frozenset(rejected))
 
     def squared_difference(
-        self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
+        self, other: "LinearisedRows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
     ) -> float:
         """Compute the sum of squared differences of weighted residuals, divided by the noise; infinite for other rows.
 
@@ -328,13 +328,13 @@ class AbstractDesignRegression(AbstractRegression):
         """
 
     def held_out_errors_refitted(
-        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], update_count: int
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], noise_update_count: int
     ) -> HeldOutErrors:
         """Return the errors of every fold, predicted without it, with updated noise and prior scales."""
         parts = []
         for groups in folds:
             rest = self.without_groups(groups).maximise_evidence(
-                posterior.prior, posterior.noise, update_count
+                posterior.prior, posterior.noise, noise_update_count
             )
             parts.append(self.held_out_errors(rest, [groups]))
         return HeldOutErrors.concatenate(parts)

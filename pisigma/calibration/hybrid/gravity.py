@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, LinearisedRows
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE, ROUGH_TOLERANCE
 from pisigma.estimation.regression import Posterior
@@ -46,7 +46,7 @@ def to_first_row_frame(robot: Robot, direction: Direction) -> Direction:
 
 
 def gravity_by_evidence(
-    robot: Robot, rows: Rows, noise: tuple[float, ...], prior_scale: Sequence[float]
+    robot: Robot, rows: LinearisedRows, noise: tuple[float, ...], prior_scale: Sequence[float]
 ) -> Direction:
     """Find the direction of gravity in the base frame, for robots on walls, rails, ceilings and inclined pedestals.
 

@@ -85,7 +85,7 @@ class CalibrationNoise:
         return self.value[name]
 
 
-def stated_sigmas(sensors: Iterable[AbstractSensor]) -> dict[str, float]:
+def median_stated_sigmas(sensors: Iterable[AbstractSensor]) -> dict[str, float]:
     """Return the median of the stated standard deviations [m or rad], by sensor whose rows state them."""
     return {sensor.name: median_sigma(sensor) for sensor in sensors if sensor.sigma is not None}
 

@@ -11,7 +11,13 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows, chunks, robust_weights
+from pisigma.calibration.hybrid.design import (
+    AbstractDesignRegression,
+    Design,
+    LinearisedRows,
+    chunks,
+    robust_weights,
+)
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import FeatureChoice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values
@@ -45,7 +51,7 @@ class RefinedFit:
         held_out_errors: held-out predictions of the folds of the search; None if the model was fitted again after it.
     """
 
-    rows: Rows
+    rows: LinearisedRows
     design: Design
     posterior: Posterior
     regression: AbstractDesignRegression
@@ -79,7 +85,7 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: F
 
 
 def _refined(
-    rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
+    rows: LinearisedRows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
 ) -> RefinedFit:
     problem = design.problem
     point = problem.prior_mean.index_add(0, problem.active, posterior.x[: design.active_count])
@@ -116,7 +122,7 @@ def chunked_correction(correction: JointCorrection) -> Shift:
 
 def linearise_rows(
     design: Design, x: Float64[Tensor, " unknowns"], effective_unknowns: float, group: Int64[Tensor, " rows"]
-) -> Rows:
+) -> LinearisedRows:
     """Return all rows linearised at given unknowns, with robust weights from their residuals.
 
     Args:
@@ -130,7 +136,7 @@ def linearise_rows(
     values = sensor_values(
         problem, point, chunked_correction(correction_from_weights(design, x)) if design.features else None
     )
-    return Rows.from_linearisation(
+    return LinearisedRows.from_linearisation(
         design, x, values, robust_weights(problem, values, effective_unknowns), group
     )
 

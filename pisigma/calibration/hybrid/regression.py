@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows, chunks
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, LinearisedRows, chunks
 from pisigma.calibration.hybrid.sensor_values import SensorValues
-from pisigma.estimation.cholesky import BLOCK, return_free_memory, row_blocks
+from pisigma.estimation.cholesky import BLOCK, release_free_memory, row_blocks
 from pisigma.estimation.dual_regression import DualRegression, group_gram, pair_indices, stack_groups
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.primal_regression import PrimalRegression, SolvedRegression
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import Posterior, SensorCount
+from pisigma.estimation.regression import Posterior, SensorValueCount
 from pisigma.joint_correction.feature import AbstractFeature
 
 _NARROW = 64
@@ -32,10 +32,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     """
 
     design: Design
-    rows: Rows
+    rows: LinearisedRows
 
     @staticmethod
-    def from_rows(design: Design, rows: Rows) -> "NormalEquations":
+    def from_rows(design: Design, rows: LinearisedRows) -> "NormalEquations":
         """Return the normal equations of the rows, summed chunk by chunk.
 
         The columns of a joint's weights are its features times the derivative with respect to its value, `J_j f_jm`.
@@ -43,7 +43,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         the products.
         """
         size = design.unknowns
-        return_free_memory(size)
+        release_free_memory(size)
         normal = design.problem.q.new_empty((len(rows.values), size, size))
         descent, square = normal.new_empty((len(rows.values), size)), []
         for k, sensor in enumerate(rows.values):
@@ -54,7 +54,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         """Return the regression for a subset of the features; see `AbstractDesignRegression.select`."""
         if design.unknowns == self.design.unknowns and design.features == self.design.features:
             return self
-        return_free_memory(design.unknowns)
+        release_free_memory(design.unknowns)
         columns = self.design.indices(design.features)
         normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
         for whole, part in zip(self.normal, normal, strict=True):
@@ -67,7 +67,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         Existing sums are copied.
         """
         self.latest_solution.clear()
-        return_free_memory(design.unknowns)
+        release_free_memory(design.unknowns)
         before = self.design.indices(design.features[:-1])
         first, new = len(before), slice(len(before), None)
         normal = self.normal.new_empty((len(self.normal), design.unknowns, design.unknowns))
@@ -108,7 +108,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
     def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: SolvedRegression) -> HeldOutErrors:
         """Return the errors of one fold, predicted without it."""
-        return_free_memory(len(solved.x))
+        release_free_memory(len(solved.x))
         test, x = self.rows.held_out_rows(groups).values, solved.x
         whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
         r, number, first = [], [], 0
@@ -155,7 +155,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             normal=(normal[:, new] - root.t() @ root)[None],
             descent=(descent[new] - cross @ solved.x)[None],
             squared_values=(rest,),
-            sensors=(SensorCount(float(len(new)), False, True),),
+            sensors=(SensorValueCount(float(len(new)), False, True),),
         )
         whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.class_count)
         first = int(whole.group[design.unknowns :].min())
@@ -249,11 +249,11 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
     """
 
     design: Design
-    rows: Rows
+    rows: LinearisedRows
     group: Int64[Tensor, " values"]
 
     @staticmethod
-    def from_rows(design: Design, rows: Rows) -> "ValueCovariance":
+    def from_rows(design: Design, rows: LinearisedRows) -> "ValueCovariance":
         """Return the matrices K of all rows."""
         parts = []
         for k, sensor in enumerate(rows.values):
@@ -343,7 +343,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         return torch.split(measured[group.argsort(stable=True)], counts)
 
 
-def build_regression(design: Design, rows: Rows) -> AbstractDesignRegression:
+def build_regression(design: Design, rows: LinearisedRows) -> AbstractDesignRegression:
     """Return normal equations, or the covariance of the values if they are few and fewer than the unknowns."""
     values = sum(sensor.residual.numel() for sensor in rows.values)
     few = values <= min(MAX_VALUES, design.unknowns)
@@ -351,9 +351,11 @@ def build_regression(design: Design, rows: Rows) -> AbstractDesignRegression:
 
 
 def extend_regression(
-    before: AbstractDesignRegression, design: Design, rows: Rows
+    regression: AbstractDesignRegression, design: Design, rows: LinearisedRows
 ) -> AbstractDesignRegression:
     """Return the regression of the same rows on a design with a subset of the features and a new last feature."""
     return (
-        before.with_feature(design) if isinstance(before, NormalEquations) else build_regression(design, rows)
+        regression.with_feature(design)
+        if isinstance(regression, NormalEquations)
+        else build_regression(design, rows)
     )

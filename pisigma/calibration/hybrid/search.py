@@ -14,7 +14,7 @@ from pisigma.calibration.hybrid.design import (
     MAX_GROUPS,
     AbstractDesignRegression,
     Design,
-    Rows,
+    LinearisedRows,
 )
 from pisigma.calibration.hybrid.regression import build_regression, extend_regression
 from pisigma.estimation.held_out import HeldOutErrors
@@ -119,7 +119,7 @@ class FeatureChoice:
         regression: regression of the rows on the best design, if available.
     """
 
-    rows: Rows
+    rows: LinearisedRows
     geometry: FeatureFit
     best: FeatureFit
     trials: tuple[Trial, ...]
@@ -131,7 +131,7 @@ class FeatureSearch:
 
     def __init__(
         self,
-        rows: Rows,
+        rows: LinearisedRows,
         noise: tuple[float, ...],
         prior_scale: Sequence[float],
         largest: Sequence[AbstractFeature],

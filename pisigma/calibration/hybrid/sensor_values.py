@@ -163,33 +163,33 @@ class SensorValues:
 
 
 def weight_columns(
-    joints: Float64[Tensor, "values components dof"], feature: AbstractFeature, state: JointState
+    joint_derivatives: Float64[Tensor, "values components dof"], feature: AbstractFeature, state: JointState
 ) -> Float64[Tensor, "values components _weights"]:
     """Compute the derivative with respect to the weights of the used columns of a feature, concatenated for all joints.
 
     Args:
-        joints: derivative with respect to the joint values.
+        joint_derivatives: derivative with respect to the joint values.
         feature: the feature.
         state: joint state of every row.
     """
     used = feature.used.flatten()
-    block = (joints[..., None] * feature.columns_of_rows(state)[:, None]).flatten(2)
+    block = (joint_derivatives[..., None] * feature.columns_of_rows(state)[:, None]).flatten(2)
     return block if bool(used.all()) else block[..., used]
 
 
 def sensor_values(
-    problem: CalibrationProblem, point: Float64[Tensor, " parameters"], shift: Shift | None = None
+    problem: CalibrationProblem, point: Float64[Tensor, " parameters"], correction_at: Shift | None = None
 ) -> tuple[SensorValues, ...]:
     """Return the values of every sensor, linearised at a point.
 
     Args:
         problem: rows, sensors and free parameters.
         point: values of all parameters.
-        shift: joint corrections at the point; None for no correction.
+        correction_at: joint corrections at the point; None for no correction.
     """
     robot = problem.space.robot
-    moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
-    index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
+    moved = problem if correction_at is None else replace(problem, q=problem.q + correction_at(problem.state))
+    index = torch.cat([problem.active, joint_value_parameters(problem.space).to(problem.q.device)])
     direction = problem.q.new_tensor(robot.directions)
     unknowns = problem.space.sensor_unknowns(point)
     collected: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
@@ -225,7 +225,7 @@ def sensor_values(
     return tuple(values)
 
 
-def joint_columns(space: ParameterSpace) -> Int64[Tensor, " dof"]:
+def joint_value_parameters(space: ParameterSpace) -> Int64[Tensor, " dof"]:
     """Return for every joint the parameter that acts like its value: theta of a revolute, d of a prismatic joint."""
     robot = space.robot
     return torch.tensor(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.design import Design, LinearisedRows
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import angle_per_joint_value
 
@@ -22,7 +22,7 @@ BLOCK = 64
 
 
 def find_spectral_lines(
-    design: Design, rows: Rows, posterior: Posterior, lowest_order: int
+    design: Design, rows: LinearisedRows, posterior: Posterior, lowest_order: int
 ) -> tuple[tuple[int, ...], ...]:
     """Find the orders of the spectral lines of every joint, strongest first.
 
@@ -56,7 +56,7 @@ def log_number_of_orders(joints: int) -> float:
 
 
 def _slope_and_curvature(
-    design: Design, rows: Rows, posterior: Posterior
+    design: Design, rows: LinearisedRows, posterior: Posterior
 ) -> tuple[Float64[Tensor, "rows dof"], Float64[Tensor, "rows dof"]]:
     """Return first and negative second derivatives of the rows' log likelihood with respect to the joint values."""
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)

@@ -15,13 +15,13 @@ from pisigma.calibration.hybrid.design import (
     MAX_GROUPS,
     AbstractDesignRegression,
     Design,
-    Rows,
+    LinearisedRows,
 )
-from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, stated_sigmas
-from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
+from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, median_stated_sigmas
+from pisigma.calibration.hybrid.sensor_values import joint_value_parameters, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
-from pisigma.estimation.regression import Posterior, prior_size_columns
+from pisigma.estimation.held_out import HeldOutErrors, held_out_covariance_factor
+from pisigma.estimation.regression import Posterior, prior_scale_columns
 from pisigma.estimation.rounded_root import round_root
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -148,7 +148,9 @@ class PositionUncertainty:
         columns = self.pose_derivatives(state, q_moved, frame, target)[:, :3]
         variance: Tensor = self.covariance_root.left_multiply(columns).square().sum(-1)
         if correction is not None:
-            joints = columns[..., joint_columns(self.space)] * columns.new_tensor(self.space.robot.directions)
+            joints = columns[..., joint_value_parameters(self.space)] * columns.new_tensor(
+                self.space.robot.directions
+            )
             unstated = joints @ correction.unstated_covariance_root(state)
             variance = variance + unstated.square().sum(-1)
         return variance.sqrt()
@@ -180,13 +182,13 @@ class PositionUncertainty:
         return columns
 
     def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 6 weights"]:
-        joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
+        joints = J[..., joint_value_parameters(self.space)] * J.new_tensor(self.space.robot.directions)
         blocks = [weight_columns(joints, chosen, state) for chosen in self.features]
         return torch.cat([joints[..., :0], *blocks], -1)
 
 
 def position_uncertainty(
-    rows: Rows,
+    rows: LinearisedRows,
     design: Design,
     fit: AbstractDesignRegression,
     posterior: Posterior,
@@ -210,14 +212,14 @@ def position_uncertainty(
         missed = fit.held_out_errors_refitted(posterior, folds, updates)
     else:
         missed = held_out_errors or fit.held_out_errors(posterior, folds)
-    variance_factor = held_out_scale(missed)
+    variance_factor = held_out_covariance_factor(missed)
     root = fit.covariance_root(posterior)
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
-    root = root.with_columns(prior_size_columns(posterior, root), variance_factor**0.5, change)
+    root = root.with_columns(prior_scale_columns(posterior, root), variance_factor**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     setup = geometry.setup
     if setup is not None and setup.joint_repeatability and "corner" in value:
         factor = corner_sigma_factor(setup.measurements, value["corner"])
         value[JOINT] = factor * setup.joint_repeatability
-    noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
+    noise = CalibrationNoise(value, median_stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, variance_factor, noise)

@@ -121,7 +121,7 @@ def show_fleet(
 
 def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     """Print the prior of a fleet: what its robots have in common."""
-    from pisigma.reporting.derived_cards import UNDETERMINED, common_error_table, spectrum_table
+    from pisigma.reporting.derived_cards import UNDETERMINED, common_error_table, weight_spread_table
     from pisigma.reporting.verdict import Verdict, count_text
 
     summary = result.summary
@@ -136,7 +136,7 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     print_screen(
         verdict,
         summary.warnings,
-        [table_block("joint correction", *spectrum_table(summary))],
+        [table_block("joint correction", *weight_spread_table(summary))],
         [
             table_block(
                 f"parameters that {summary.robots} robots have in common", *common_error_table(summary)

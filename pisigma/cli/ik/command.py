@@ -136,9 +136,9 @@ def _print_pose(
     import numpy as np
 
     from pisigma.reporting.solution_text import failure_sentence, solution_records, solution_text
-    from pisigma.workflow.load import stated_pose
+    from pisigma.workflow.load import pose_from_mm_and_deg
 
-    T, places = stated_pose(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
+    T, places = pose_from_mm_and_deg(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
         if not solver.closed_form:  # only solutions, without padding

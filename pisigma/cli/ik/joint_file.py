@@ -103,7 +103,7 @@ def write_joint_file(
     branch: str | None,
     report_progress: Callable[[str], None],
     accuracy: bool = False,
-    path: bool = False,
+    is_path: bool = False,
 ) -> PoseFileResult:
     """Write one row per pose of a file of any length, completely or not at all.
 
@@ -118,7 +118,7 @@ def write_joint_file(
         branch: name of the branch to use instead of the default.
         report_progress: callback for progress, such as "40,000 rows, 4%, 9,000 rows/s".
         accuracy: whether to predict the standard deviations, which takes most of the time with a hybrid.
-        path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
+        is_path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
 
     Raises:
         MeasurementError: the file of poses or its header cannot be used.
@@ -130,8 +130,8 @@ def write_joint_file(
         writer = csv.writer(file, lineterminator="\n")
         header = _header(solver, accuracy)
         writer.writerow(header)
-        for chunk in read_pose_chunks(poses, sys.maxsize if path else CHUNK_ROWS):
-            chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome, path)
+        for chunk in read_pose_chunks(poses, sys.maxsize if is_path else CHUNK_ROWS):
+            chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome, is_path)
             writer.writerows(cells + [""] * (len(header) - len(cells)) for cells in chunk_rows)
             rate = outcome.rows / max(time.monotonic() - begun, 1e-3)
             share = "" if math.isnan(chunk.read_fraction) else f", {100 * chunk.read_fraction:.0f} %"

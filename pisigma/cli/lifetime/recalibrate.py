@@ -78,7 +78,7 @@ def recalibrate_into(
     overwrite: bool,
     as_json: bool,
     verbose: bool = False,
-    nominal: "Robot | None" = None,
+    fleet_robot: "Robot | None" = None,
 ) -> None:
     """Recalibrate a model with new rows, write the chosen model if a folder is stated, and print the result.
 
@@ -92,7 +92,7 @@ def recalibrate_into(
         overwrite: replace the model in the folder.
         as_json: print one JSON object.
         verbose: print all tables.
-        nominal: the robot, if the model must be the prior of its fleet; None for any model.
+        fleet_robot: the robot, if the model must be the prior of its fleet; None for any model.
 
     Raises:
         ModelError: the model belongs to another robot, or is not a fleet prior.
@@ -100,7 +100,7 @@ def recalibrate_into(
     from pisigma.workflow import recalibrate as workflow
 
     with progress_of("recalibration") as progress:
-        recalibration = workflow.recalibrate(model, data, settings, progress, nominal)
+        recalibration = workflow.recalibrate(model, data, settings, progress, fleet_robot)
     if out is None:
         _print(recalibration, None, as_json, verbose)
         if not (recalibration.trusted or accept_implausible):

@@ -34,7 +34,7 @@ POSES = 1_000
 """Number of poses for the fit, and number of other poses for its evaluation."""
 
 
-def joint_offsets(robot: Robot) -> tuple[int, ...]:
+def joint_offset_indices(robot: Robot) -> tuple[int, ...]:
     """Return the indices into the flattened `Robot.dh` of theta of revolute and d of prismatic joints."""
     columns = (0 if joint.type == "revolute" else 1 for joint in robot.joints)
     return tuple(
@@ -161,7 +161,7 @@ def _small(step: Float64[Tensor, " 6"]) -> Float64[Tensor, "4 4"]:
 
 
 @dataclass(frozen=True)
-class Departure:
+class ToolDeviation:
     """Deviation of a robot's tool from the tool of the whole model.
 
     Attributes:
@@ -193,12 +193,12 @@ class GeometricApproximation:
     q: Float64[Tensor, "poses dof"]
     T: Float64[Tensor, "poses 4 4"]
 
-    def deviation_of(self, robot: Robot) -> Departure:
+    def deviation_of(self, robot: Robot) -> ToolDeviation:
         """Compute the deviation of a robot from the model."""
         T = forward_kinematics(robot, self.q)
         distance = (T[:, :3, 3] - self.T[:, :3, 3]).norm(dim=-1)
         angle = rotation_vector(T[:, :3, :3].mT @ self.T[:, :3, :3]).norm(dim=-1)
-        return Departure(
+        return ToolDeviation(
             mean_mm=float(distance.mean()) * 1e3,
             p95_mm=float(distance.quantile(0.95)) * 1e3,
             max_mm=float(distance.max()) * 1e3,
@@ -206,7 +206,7 @@ class GeometricApproximation:
         )
 
 
-def departure_from_nominal(robot: Robot, nominal: Robot) -> Departure:
+def departure_from_nominal(robot: Robot, nominal: Robot) -> ToolDeviation:
     """Compute the deviation of a robot's tool from that of another robot, each with its base and tool.
 
     It is evaluated at random joint values within the limits of `nominal` and within ±180 deg (±3 m).

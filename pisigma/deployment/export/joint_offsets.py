@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.deployment.export.approximation import Departure, approximate_model, joint_offsets
+from pisigma.deployment.export.approximation import ToolDeviation, approximate_model, joint_offset_indices
 from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, csv_table, header_comment, parameter_columns
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
@@ -36,8 +36,8 @@ class JointOffsets:
     robot: Robot
     values: Float64[np.ndarray, " axes"]
     unobservable: tuple[str, ...]
-    departure: Departure
-    nominal: Departure
+    departure: ToolDeviation
+    nominal: ToolDeviation
 
     def departures(self) -> dict[str, object]:
         """Return both deviations, by their keys in files."""
@@ -49,10 +49,10 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
     Raises:
         ModelError: the model has no stored joint values, or no predictions at them.
-        RobotError: see `joints_by_axes`.
+        RobotError: see `joint_derivatives_by_axis`.
     """
     nominal = model.robot
-    fit = approximate_model(model, nominal, joint_offsets(nominal))
+    fit = approximate_model(model, nominal, joint_offset_indices(nominal))
     return JointOffsets(
         robot=fit.robot,
         values=offsets_between(nominal, fit.robot),
@@ -68,14 +68,14 @@ def offsets_between(nominal: Robot, corrected: Robot) -> Float64[np.ndarray, " a
     """Return the offsets of a corrected robot's zero positions from nominal, per axis of the controller [rad or m].
 
     Raises:
-        RobotError: see `joints_by_axes`.
+        RobotError: see `joint_derivatives_by_axis`.
     """
-    change = (corrected.dh - nominal.dh).reshape(-1)[list(joint_offsets(nominal))]
-    offsets: np.ndarray = np.linalg.solve(joints_by_axes(nominal), change)
+    change = (corrected.dh - nominal.dh).reshape(-1)[list(joint_offset_indices(nominal))]
+    offsets: np.ndarray = np.linalg.solve(joint_derivatives_by_axis(nominal), change)
     return offsets
 
 
-def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
+def joint_derivatives_by_axis(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
     """Return the derivative of theta or d of every joint with respect to the offset of every axis of the controller.
 
     Raises:
@@ -100,14 +100,16 @@ _MEANING = (
 )
 
 
-def departure_sentence(subject_and_verb: str, departure: Departure, nominal: Departure) -> str:
+def departure_sentence(
+    subject_and_verb: str, departure: ToolDeviation, nominal_deviation: ToolDeviation
+) -> str:
     """Return a sentence on the deviation from the whole model, compared with that of the nominal robot."""
     return (
         f"{subject_and_verb} from the whole model by {departure.mean_mm:.4g} mm on average, "
         f"{departure.p95_mm:.4g} mm at the 95 % quantile, {departure.max_mm:.4g} mm at most, "
         f"and {departure.mean_mrad:.4g} mrad on average (the nominal robot with "
-        f"the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm "
-        f"and {nominal.mean_mrad:.4g} mrad)."
+        f"the model's base and tool: {nominal_deviation.mean_mm:.4g}, {nominal_deviation.p95_mm:.4g}, "
+        f"{nominal_deviation.max_mm:.4g} mm and {nominal_deviation.mean_mrad:.4g} mrad)."
     )
 
 
@@ -167,7 +169,7 @@ def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
         )
     offsets = np.array([_offset(axis, joints[axis.name], source) for axis in nominal.axes])
     dh = nominal.dh.copy()
-    dh.reshape(-1)[list(joint_offsets(nominal))] += joints_by_axes(nominal) @ offsets
+    dh.reshape(-1)[list(joint_offset_indices(nominal))] += joint_derivatives_by_axis(nominal) @ offsets
     frames = {
         str(entry["part"]): _frame(entry, source)
         for entry in entries

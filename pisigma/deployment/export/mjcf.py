@@ -18,7 +18,7 @@ from pisigma.deployment.export.urdf import (
     CALIBRATED_TOOL,
     check_same_geometry_as_nominal,
     check_tip,
-    missing_meshes,
+    missing_mesh_warnings,
     updated_urdf_text,
 )
 from pisigma.robot.description import Robot
@@ -57,7 +57,7 @@ def _write(request: ExportRequest) -> Exported:
             )
     directory = re.search(r'<compiler\s[^>]*meshdir="([^"]*)"', text)
     folder = request.out.parent / (directory.group(1) if directory else "")
-    warnings += missing_meshes(re.findall(r'<mesh\s[^>]*file="([^"]+)"', text), folder)
+    warnings += missing_mesh_warnings(re.findall(r'<mesh\s[^>]*file="([^"]+)"', text), folder)
     return Exported(text, facts, chosen.comments, warnings=tuple(warnings))
 
 

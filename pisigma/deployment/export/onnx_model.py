@@ -16,7 +16,7 @@ from pisigma.joint_correction.conditions import learned_conditions, with_modelle
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.onnx_chain import add_roll_pitch_yaw
 from pisigma.joint_correction.onnx_graph import OnnxGraph, import_onnx
-from pisigma.joint_correction.shared_features import add_unit_inputs
+from pisigma.joint_correction.shared_features import add_product_unit_inputs
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
@@ -116,7 +116,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
         dof, factors, inputs = correction.weight.shape
         weight = (correction.weight * correction.fixed[..., None]).detach().numpy()
         bias = (correction.bias * correction.fixed).detach().numpy().ravel()
-        phi = add_unit_inputs(graph, robot, q)
+        phi = add_product_unit_inputs(graph, robot, q)
         sums = graph.add_node("Add", graph.add_node("MatMul", phi, weight.reshape(-1, inputs).T), bias)
         terms.append(graph.sum_of_products(graph.reshape(sums, [dof, factors]), correction.orders))
     total = terms[0] if terms else graph.add_node("Mul", q, 0.0)

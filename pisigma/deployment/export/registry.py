@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pisigma.deployment.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
 from pisigma.files.conflicts import check_conflicts
-from pisigma.files.errors import OutputError, Place, check_choice, nearest_choice
+from pisigma.files.errors import OutputError, Place, check_choice, choice_remedy
 from pisigma.files.output_file import check_output, write_atomically
 
 BUILT_IN = {
@@ -64,7 +64,7 @@ def register_export(form: ExportFormat) -> ExportFormat:
         raise OutputError(
             f"export format '{form.name}' declares the unknown option '{unknown[0]}'",
             value=unknown[0],
-            remedy=nearest_choice(unknown[0], OPTIONS),
+            remedy=choice_remedy(unknown[0], OPTIONS),
         )
     return form
 

@@ -132,10 +132,10 @@ def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, .
             "The model was made by a version that did not store the URDF file of the robot: use --like FILE to keep "
             "its links, meshes, masses and limits; this file has placeholders.",
         )
-    return missing_meshes(re.findall(r'<mesh\s[^>]*filename="([^":]+)"', text), request.out.parent)
+    return missing_mesh_warnings(re.findall(r'<mesh\s[^>]*filename="([^":]+)"', text), request.out.parent)
 
 
-def missing_meshes(names: Sequence[str], folder: Path) -> tuple[str, ...]:
+def missing_mesh_warnings(names: Sequence[str], folder: Path) -> tuple[str, ...]:
     """Return a warning if files of meshes do not exist in a folder."""
     missing = [name for name in names if not (folder / name).is_file()]
     if not missing:

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from pisigma.deployment.export.joint_offsets import JointOffsets, fit_joint_offsets
 from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.files.model_files import DESCRIPTION, WEIGHTS, content_hash, read_model_file
-from pisigma.measurement.foreign.lerobot_dataset import joint_motors
+from pisigma.measurement.foreign.lerobot_dataset import position_indices_of_motors
 from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, Motor, radians_per_unit, read_motors
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
@@ -82,7 +82,7 @@ class LeRobotCorrection:
         """
         calibrated = load_model(model)
         robot = calibrated.robot
-        joints = joints_of_values(robot, names, prefix)
+        joints = value_indices_of_axes(robot, names, prefix)
         motors = None if calibration is None else read_motors(calibration)
         scale = np.array([radians_per_unit(units, axis.name, motors) for axis in robot.axes])
         lost = fit_joint_offsets(calibrated)
@@ -101,12 +101,12 @@ class LeRobotCorrection:
             _version(Path(model), robot, units, lost, motors),
         )
 
-    def true_values(self, frames: Any) -> Any:
+    def true_values(self, recorded_values: Any) -> Any:
         """Compute the joint values at which the nominal arm has the pose that the real arm had.
 
         Args:
-            frames: joint values as recorded or commanded: an array or tensor `(*batch, values)`, or a dictionary by
-                name, such as an observation, whose other entries are kept.
+            recorded_values: joint values as recorded or commanded: an array or tensor `(*batch, values)`, or a
+                dictionary by name, such as an observation, whose other entries are kept.
 
         Returns:
             The same type, shape, dtype, device and order.
@@ -114,24 +114,24 @@ class LeRobotCorrection:
         Raises:
             MeasurementError: the last axis does not have one value per name, or a name is missing.
         """
-        return self._moved(frames, self.offset)
+        return self._moved(recorded_values, self.offset)
 
-    def commands(self, frames: Any) -> Any:
+    def commands(self, true_values: Any) -> Any:
         """Compute the joint values to command for true joint values; the inverse of `true_values`.
 
         LeRobot limits normalized values to -100 to 100 when it sends them, so an arm stops there.
         """
-        return self._moved(frames, -self.offset)
+        return self._moved(true_values, -self.offset)
 
-    def joint_values(self, frames: Any) -> Float64[np.ndarray, "*batch axes"]:
+    def joint_values(self, recorded_values: Any) -> Float64[np.ndarray, "*batch axes"]:
         """Convert frames `(*batch, values)` to the robot's joint values [rad]."""
-        array = self._checked(np.asarray(frames, dtype=np.float64))
+        array = self._checked(np.asarray(recorded_values, dtype=np.float64))
         values: np.ndarray = array[..., list(self.joints)] * self.scale
         return values
 
-    def poses(self, frames: Any) -> Float64[np.ndarray, "*batch 4 4"]:
+    def poses(self, recorded_values: Any) -> Float64[np.ndarray, "*batch 4 4"]:
         """Compute the poses T_base_tool [m] that the whole model predicts for recorded frames `(*batch, values)`."""
-        q = self.joint_values(frames)
+        q = self.joint_values(recorded_values)
         flat = torch.from_numpy(q.reshape(-1, q.shape[-1]))
         T = (
             torch.cat([self.model.forward(some) for some in torch.split(flat, CHUNK)])
@@ -198,14 +198,14 @@ def _checked_type(values: Any, what: str) -> Any:
     return values
 
 
-def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[int, ...]:
+def value_indices_of_axes(robot: Robot, names: Sequence[str], prefix: str) -> tuple[int, ...]:
     """Return the index of the value of every axis of the robot's controller.
 
     Raises:
         MeasurementError: the motors are not the joints of the robot, or a joint is prismatic.
     """
     axes = [axis.name for axis in robot.axes]
-    motors = joint_motors(names, prefix)
+    motors = position_indices_of_motors(names, prefix)
     if sorted(motors) != sorted(axes) or any(axis.type != "revolute" for axis in robot.axes):
         raise MeasurementError(
             expected=f"one value for each of the revolute joints {', '.join(axes)} of robot '{robot.name}'",

@@ -28,9 +28,9 @@ from pisigma.files.errors import (
     PisigmaError,
     RequestError,
     check_choice,
+    choice_remedy,
     make_printable,
     missing_extra,
-    nearest_choice,
 )
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import xyz_zyx_of
@@ -167,7 +167,7 @@ class JsonLines(AbstractProtocol):
             raise RequestError(
                 f"the key cannot be combined with '{task}'",
                 option=key,
-                remedy=nearest_choice(key, _KEYS[task]),
+                remedy=choice_remedy(key, _KEYS[task]),
             )
         if task == "ask":
             return *self._question(request), {}

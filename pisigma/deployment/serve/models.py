@@ -15,7 +15,7 @@ import numpy as np
 
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_format
-from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, nearest_choice
+from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, choice_remedy
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
@@ -287,7 +287,7 @@ class ServedModels:
             expected="the name or the index of a model",
             value=repr(name)[:40],
             option="model",
-            remedy=nearest_choice(str(name), names),
+            remedy=choice_remedy(str(name), names),
         )
 
     def reload(self) -> list[str]:

@@ -134,14 +134,17 @@ class Acceptance:
 
 
 def missing_statements(
-    instrument: Instrument, repeatability_mm: float | None, measured: str, repeats: tuple[RepeatedPose, ...]
+    instrument: Instrument,
+    repeatability_mm: float | None,
+    unmeasured_reason: str,
+    repeats: tuple[RepeatedPose, ...],
 ) -> tuple[str, ...]:
     """Return sentences about the statements that an acceptance lacks.
 
     Args:
         instrument: the instrument.
         repeatability_mm: pose repeatability stated by the manufacturer [mm]; None if it is not stated.
-        measured: reason why there are no measured errors; empty if there are some.
+        unmeasured_reason: reason why there are no measured errors; empty if there are some.
         repeats: figures of repeated poses.
     """
     names = ("name", "serial", "certificate", "calibrated")
@@ -150,8 +153,8 @@ def missing_statements(
     ]
     if repeatability_mm is None:
         lines.append("pose repeatability of the maker: pose_repeatability_mm in cell.yaml.")
-    if measured:
-        lines.append(f"measured errors: {measured}")
+    if unmeasured_reason:
+        lines.append(f"measured errors: {unmeasured_reason}")
     if not repeats:
         lines.append("AP and RP: no pose was measured more than once.")
     elif (fewest := min(one.rows for one in repeats)) < CYCLES:

@@ -101,7 +101,7 @@ class ActiveExport:
 
 
 @dataclass(frozen=True)
-class Controller:
+class ControllerHistory:
     """History of the exports that were active on a controller.
 
     Attributes:
@@ -113,9 +113,9 @@ class Controller:
     exports: tuple[ExportEntry, ...] = ()
 
     @staticmethod
-    def from_history(history: History) -> "Controller":
+    def from_history(history: History) -> "ControllerHistory":
         """Return the controller of a cell."""
-        return Controller(history.controller(), history.exports())
+        return ControllerHistory(history.controller(), history.exports())
 
     def active_exports(self, day: str = "9999", time: str = "") -> dict[Contents, ActiveExport]:
         """Return the exports that were active at the end of a day, by contents.
@@ -234,7 +234,7 @@ class Findings:
 
 
 def valid_sessions(
-    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: Controller
+    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: ControllerHistory
 ) -> tuple[SessionEntry, ...]:
     """Return the sessions that describe the current state of the arm.
 
@@ -258,7 +258,7 @@ def export_records(active: dict[Contents, ActiveExport]) -> list[dict[str, str]]
 
 def findings(history: History, command: str, model: ModelEntry | None) -> Findings:
     """Apply `RULES` to a command on a cell that uses a model; see `Controller.findings`."""
-    return Controller.from_history(history).findings(command, model, history.sessions())
+    return ControllerHistory.from_history(history).findings(command, model, history.sessions())
 
 
 def checked_model_folder(path: Path, command: str) -> tuple[Path, tuple[str, ...]]:

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pisigma.files.errors import PlanningError
 from pisigma.files.model_files import is_unchanged
 from pisigma.files.yaml_file import read_yaml
-from pisigma.lifetime.cell.controller import Controller, valid_sessions
+from pisigma.lifetime.cell.controller import ControllerHistory, valid_sessions
 from pisigma.lifetime.cell.events import CHANGING_EVENTS, Event
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import (
@@ -80,7 +80,7 @@ class CellFacts:
     settings_sha256: str = ""
     changed_models: tuple[str, ...] = ()
     measured_pose_text: str = ""
-    controller: Controller = field(default_factory=Controller)
+    controller: ControllerHistory = field(default_factory=ControllerHistory)
     has_several_arms: bool = False
 
     @cached_property
@@ -227,7 +227,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
             name for name, sha256 in checked.items() if not is_unchanged(folder / MODELS / name, sha256)
         ),
         measured_pose_text=_incomplete(folder, sessions, checks),
-        controller=Controller.from_history(history),
+        controller=ControllerHistory.from_history(history),
         has_several_arms=is_cell_of_arms(folder),
     )
 

@@ -12,13 +12,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from pisigma.files.errors import OutputError, Place
 from pisigma.lifetime.cell.history import History, MonitoredSession
-from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.lifetime.monitoring.session import JointZeros, SessionResult
 from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.training_rows import repeated_row_warnings
 
-_SESSION = TypeAdapter(Session)
+_SESSION = TypeAdapter(SessionResult)
 _VALUES = {
     "numbers": "rows_numbers",
     "rounding_steps": "rows_steps",
@@ -54,7 +54,7 @@ class Record:
     date: str
     rows_sha256: str
     temperature_c: float | None
-    session: Session
+    session: SessionResult
     zeros: JointZeros
     values: RowValues | None = None
 
@@ -78,7 +78,7 @@ class Record:
         }
 
 
-def store_sessions(history: History, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
+def store_sessions(history: History, model_sha256: str, records: Sequence[Record]) -> tuple[Record, ...]:
     """Store sessions in a history and return all sessions of the model.
 
     All sessions are stored in one transaction, or none if the process ends earlier. A session with the same rows as a
@@ -86,7 +86,7 @@ def store_sessions(history: History, model: str, records: Sequence[Record]) -> t
 
     Args:
         history: history of the model, or of its cell.
-        model: hash of the model.
+        model_sha256: hash of the model.
         records: sessions to store.
 
     Returns:
@@ -95,17 +95,17 @@ def store_sessions(history: History, model: str, records: Sequence[Record]) -> t
     Raises:
         OutputError: the file is not a history or cannot be written.
     """
-    history.add(*(_entry(model, one) for one in records))
-    return read_sessions(history, model)
+    history.add(*(_entry(model_sha256, one) for one in records))
+    return read_sessions(history, model_sha256)
 
 
-def read_sessions(history: History, model: str) -> tuple[Record, ...]:
+def read_sessions(history: History, model_sha256: str) -> tuple[Record, ...]:
     """Read all sessions of a model, sorted by date; empty if there is no history yet.
 
     Raises:
         OutputError: the file is not a history, or a session cannot be read.
     """
-    entries = [one for one in history.monitored_sessions() if one.model_sha256 == model]
+    entries = [one for one in history.monitored_sessions() if one.model_sha256 == model_sha256]
     try:
         return sorted_sessions([_record(one) for one in entries])
     except (ValidationError, ValueError, KeyError) as problem:
@@ -170,7 +170,7 @@ def new_rows(
     rows: Measurements,
     date: str,
     earlier: Sequence[Record],
-    judged: Sequence[Record],
+    current_sessions: Sequence[Record],
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the rows that neither belong to the calibration of the model nor to other sessions.
 
@@ -179,7 +179,7 @@ def new_rows(
         rows: rows of a session.
         date: date of the session.
         earlier: sessions of the history; a session with exactly these rows is replaced, see `store_sessions`.
-        judged: sessions of this call.
+        current_sessions: sessions of this call.
 
     Returns:
         The new rows, and a warning for each set of rows that was left out.
@@ -190,7 +190,7 @@ def new_rows(
         for one in earlier
         if one.rows_sha256 == sha256 and one.date != date
     ]
-    others = [*(one for one in earlier if one.rows_sha256 != sha256), *judged]
+    others = [*(one for one in earlier if one.rows_sha256 != sha256), *current_sessions]
     those = [(model.training_values, f"training rows of {model.name}")]
     those += [(one.values, f"rows of {one.file} of {one.date}") for one in others]
     for values, of in those:

@@ -16,7 +16,7 @@ from pisigma.estimation.alternatives import Explanation, GroupMotion, SessionEvi
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.files.errors import IdentificationError
-from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise
+from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_calibration
 from pisigma.lifetime.recalibration.movement import (
     HistoryMovement,
     Movement,
@@ -72,7 +72,7 @@ class JointZeros:
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionResult:
     """Result of comparing a session with a model.
 
     Attributes:
@@ -168,7 +168,7 @@ def judge_session(
     posterior: ModelPosterior,
     rows: Measurements,
     relocated: Set[FrameKey] | None = None,
-) -> tuple[Session, JointZeros]:
+) -> tuple[SessionResult, JointZeros]:
     """Compare, by their evidence, all movements that may have happened since a model was made.
 
     Args:
@@ -262,7 +262,7 @@ def _solve(
 ) -> _Solved:
     """Linearise and explain repeatedly until the linearisation converges."""
     problem = recalibration_problem(model, posterior, rows, relocated)
-    noise = usual_noise(problem)
+    noise = noise_of_calibration(problem)
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
     wrong: Mapping[int, float] = {}
@@ -307,7 +307,7 @@ def _freed(motion: GroupMotion) -> DriftGroup:
     return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
 
 
-def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
+def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> SessionResult:
     """Compute the result of a session."""
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
     rows = every.select((~wrong).nonzero()[:, 0])
@@ -322,7 +322,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     optimism = math.sqrt(
         count / max(count - determined, 1)
     )  # residuals are too small, because the rows determined the movement
-    return Session(
+    return SessionResult(
         rows=every.rows,
         unchanged_probability=explanation.unchanged_probability,
         movements=_moved(solved, relocated),

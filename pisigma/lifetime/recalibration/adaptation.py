@@ -12,8 +12,8 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_c
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.joint_repeatability import corner_sigma_factor
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
-from pisigma.calibration.hybrid.design import Rows
-from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, stated_sigmas
+from pisigma.calibration.hybrid.design import LinearisedRows
+from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, median_stated_sigmas
 from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
@@ -102,7 +102,7 @@ class Adaptation:
         """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
         root = torch.cat([self.update.covariance_root(), self.problem.held_covariance_root], 1)
         active = self.problem.design.active_count
-        return torch.cat([self.problem.coordinate_change @ root[:active], root[active:]])
+        return torch.cat([self.problem.coordinate_jacobian @ root[:active], root[active:]])
 
     @property
     def noise(self) -> CalibrationNoise:
@@ -114,7 +114,7 @@ class Adaptation:
             value[JOINT] = setup.joint_repeatability * corner_sigma_factor(
                 setup.measurements, value["corner"]
             )
-        return CalibrationNoise(value, stated_sigmas(sensors))
+        return CalibrationNoise(value, median_stated_sigmas(sensors))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Compute measured minus predicted values; see `CalibrationResult.errors_of`."""
@@ -130,11 +130,11 @@ def adapt(
 
     Args:
         problem: rows and prior.
-        initial_noise: noise of each sensor [m or rad], or a factor if the rows state it; None for `usual_noise`.
+        initial_noise: noise of each sensor [m or rad], or a factor if rows state it; None for that of the calibration.
         start: initial sizes and noise, for example from other rows of the session; None for zero drift.
     """
     design, mean = problem.design, problem.mean
-    initial_noise = usual_noise(problem) if initial_noise is None else initial_noise
+    initial_noise = noise_of_calibration(problem) if initial_noise is None else initial_noise
     group = held_out_groups(problem.setup.measurements)
     x, effective = mean, 0.0
     wrong: Mapping[int, float] = {}
@@ -169,7 +169,7 @@ def adapt(
     )
 
 
-def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
+def noise_of_calibration(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
     """Return the noise of all sensors of a problem in the calibration [m or rad]; a factor if the new rows state it.
 
     Raises:
@@ -183,7 +183,7 @@ def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
     return torch.tensor(chosen, dtype=torch.float64)
 
 
-def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
+def linear_values(problem: RecalibrationProblem, rows: LinearisedRows) -> LinearValues:
     """Concatenate the values of all sensors, with residuals relative to the model."""
     X, y, sensor, configuration = [], [], [], []
     for number, one in enumerate(rows.values):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from pisigma.files.errors import IdentificationError, ModelError
-from pisigma.lifetime.monitoring.session import Session, format_probability, judge_session
+from pisigma.lifetime.monitoring.session import SessionResult, format_probability, judge_session
 from pisigma.lifetime.recalibration.movement import Movement, is_frame
 from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
 from pisigma.measurement.dataset import Measurements
@@ -21,7 +21,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.setup_faults.cause import join_words, length_text
-from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, measured_rows
+from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, rows_with_position
 from pisigma.validation.setup_faults.setup_faults import without_unknown_orientation
 
 _MAX_ROWS = 60
@@ -30,7 +30,7 @@ _MAX_ROWS = 60
 
 def find_motion(
     model: CalibratedModel, rows: Measurements, fitted_kinds: Collection[FrameKind] = ()
-) -> Session | None:
+) -> SessionResult | None:
     """Find the joints, lengths, base or tool that have moved since a model was made; see `judge_session`.
 
     Args:
@@ -47,7 +47,7 @@ def find_motion(
         some = without_unknown_orientation(model, rows)
         if rows.position is not None:
             some = replace(
-                some.select(evenly_spaced_rows(measured_rows(rows), _MAX_ROWS)), pair=None, distance=None
+                some.select(evenly_spaced_rows(rows_with_position(rows), _MAX_ROWS)), pair=None, distance=None
             )
         some = posterior.with_model_names(some)
         with torch.no_grad():
@@ -61,7 +61,7 @@ def find_motion(
 
 
 def session_diagnostics(
-    model: CalibratedModel, rows: Measurements, session: Session
+    model: CalibratedModel, rows: Measurements, session: SessionResult
 ) -> tuple[Diagnostic, ...]:
     """Return findings that state why a session is implausible although the checks of its rows found nothing.
 
@@ -84,7 +84,7 @@ def session_diagnostics(
     return excessive_change_diagnostics(model.robot, session.movements)
 
 
-def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
+def motion_sentence(motion: SessionResult, comparison: ModelComparison) -> str:
     """Return a sentence about movements of the arm, their probability, and the gain expected of a recalibration."""
     means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
     errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
@@ -94,7 +94,7 @@ def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
     )
 
 
-def motion_warnings(motion: Session) -> tuple[str, ...]:
+def motion_warnings(motion: SessionResult) -> tuple[str, ...]:
     """Return sentences about movements that do not change the verdict, or a change that cannot be attributed."""
     if motion.verdict == "unchanged":
         return ()
@@ -105,7 +105,7 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
     )
 
 
-def motion_text(motion: Session) -> str:
+def motion_text(motion: SessionResult) -> str:
     """Return a text about movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
     amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.movements:

@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.problem.parameters import LENGTHS, ParameterS
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
     SetupOptions,
-    coordinate_change,
+    coordinate_jacobian,
     setup_from_guess,
     usable_rows,
 )
@@ -71,7 +71,7 @@ class RecalibrationProblem:
         mean: prior mean of the unknowns, with parameters relative to `design.problem.prior_mean`.
         covariance_root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the
             setup.
-        coordinate_change: derivative of the parameters in the user's coordinates with respect to the problem's
+        coordinate_jacobian: derivative of the parameters in the user's coordinates with respect to the problem's
             parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
         held_covariance_root: root of the covariance of unknowns that are held fixed.
@@ -82,7 +82,7 @@ class RecalibrationProblem:
     design: Design
     mean: Float64[Tensor, " unknowns"]
     covariance_root: Float64[Tensor, "unknowns directions"]
-    coordinate_change: Float64[Tensor, "parameters parameters"]
+    coordinate_jacobian: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
     held_covariance_root: Float64[Tensor, "unknowns _directions"]
 
@@ -137,7 +137,7 @@ def recalibration_problem(
     setup = setup_from_guess(space, guessed, (usable, rows), options, None, HampelLoss(), dh)
     start = setup.start
     problem = setup.problem.with_active(range(len(start)))
-    change = coordinate_change(setup, start)
+    change = coordinate_jacobian(setup, start)
     root = posterior.covariance_root.new_zeros(
         (len(start) + len(posterior.weights), posterior.covariance_root.shape[1])
     )

@@ -55,7 +55,7 @@ def solve_board_pose(
     corners: Float64[np.ndarray, "corners 3"],
     pixels: Float64[np.ndarray, "corners 2"],
     loss: AbstractLoss,
-    sigma: Float64[np.ndarray, " corners"] | None = None,
+    relative_sigma: Float64[np.ndarray, " corners"] | None = None,
 ) -> BoardPose:
     """Find the pose of a flat board by Gauss-Newton steps, from the homography of its corners (Zhang 2000).
 
@@ -66,21 +66,21 @@ def solve_board_pose(
         corners: corners in the frame of the board [m], all with z near 0 and not on one line.
         pixels: their pixels in the image [px].
         loss: robust loss of the corners' residuals.
-        sigma: standard deviation of every corner relative to the median; None if all are equal.
+        relative_sigma: standard deviation of every corner relative to the median; None if all are equal.
     """
-    sigma = np.ones(len(pixels)) if sigma is None else sigma
+    relative_sigma = np.ones(len(pixels)) if relative_sigma is None else relative_sigma
     R, t = _by_homography(corners, camera.undistort(pixels))
     for _ in range(MAX_ITERATIONS):
-        residual, J, _ = linearise_pixels(camera, corners, pixels, sigma, R, t)
+        residual, J, _ = linearise_pixels(camera, corners, pixels, relative_sigma, R, t)
         root = np.sqrt(_weights(residual, loss))[:, None]
         A, b = (root[..., None] * J).reshape(-1, POSE), (root * residual).ravel()
         step = np.linalg.solve(A.T @ A, A.T @ b)
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
         if np.abs(step).max() < STEP_TOLERANCE:
             break
-    residual, J, _ = linearise_pixels(camera, corners, pixels, sigma, R, t)
+    residual, J, _ = linearise_pixels(camera, corners, pixels, relative_sigma, R, t)
     weight = _weights(residual, loss)
-    intrinsics_jacobian = camera.intrinsics_jacobian(corners @ R.T + t) / sigma[:, None, None]
+    intrinsics_jacobian = camera.intrinsics_jacobian(corners @ R.T + t) / relative_sigma[:, None, None]
     columns = np.concatenate([J, intrinsics_jacobian, residual[..., None]], -1)
     # blocks of the factor: pose, intrinsics after elimination of the pose, and the residual as last column
     factor = triangular_factor((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
@@ -112,7 +112,12 @@ def triangular_factor(
 
 
 def linearise_pixels(
-    camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
+    camera: Camera,
+    corners: np.ndarray,
+    pixels: np.ndarray,
+    relative_sigma: np.ndarray,
+    R: np.ndarray,
+    t: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return measured minus predicted pixels, and derivatives with respect to pose and point, all divided by sigma."""
     rotated = corners @ R.T
@@ -120,9 +125,9 @@ def linearise_pixels(
     rotation_jacobian = -point_jacobian @ skew(torch.from_numpy(rotated)).numpy()
     J = np.concatenate([point_jacobian, rotation_jacobian], -1)
     return (
-        (pixels - predicted) / sigma[:, None],
-        J / sigma[:, None, None],
-        point_jacobian / sigma[:, None, None],
+        (pixels - predicted) / relative_sigma[:, None],
+        J / relative_sigma[:, None, None],
+        point_jacobian / relative_sigma[:, None, None],
     )
 
 

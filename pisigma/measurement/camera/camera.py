@@ -114,7 +114,7 @@ class MatrixSection(BaseModel):
     data: tuple[float, ...]
 
 
-class MatrixDocument(BaseModel):
+class RosOrOpencvCameraDocument(BaseModel):
     """Contents of a camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
 
     Fisheye lenses are refused because their coefficients have a different meaning; binned images are refused because
@@ -184,7 +184,7 @@ class Camera:
             return parse_yaml(text, CameraDocument, MeasurementError, source).camera()
         # OpenCV writes a directive and a tag that are not YAML; commenting them out keeps the line numbers
         plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
-        document = parse_yaml(plain, MatrixDocument, MeasurementError, source)
+        document = parse_yaml(plain, RosOrOpencvCameraDocument, MeasurementError, source)
         matrix, coefficients = document.camera_matrix.data, document.distortion_coefficients.data
         if len(matrix) != 9 or matrix[0] <= 0 or matrix[4] <= 0 or any(matrix[k] for k in (1, 3, 6, 7)):
             raise MeasurementError(

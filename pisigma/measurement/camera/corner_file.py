@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, choice_remedy
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import MIN_CORNERS
 from pisigma.measurement.camera.camera import Camera
@@ -168,7 +168,7 @@ def _stated(table: Table, column: str, choices: Collection[str]) -> list[str]:
                 expected=f"the name of a {column}",
                 value=name,
                 at=table.place_of(row, column),
-                remedy=nearest_choice(name, choices),
+                remedy=choice_remedy(name, choices),
             )
     return [name or next(iter(choices)) for name in names]
 

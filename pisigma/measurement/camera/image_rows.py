@@ -250,7 +250,7 @@ def update_bend(
     camera: Camera,
     corner_numbers: Sequence[np.ndarray],
     pixels: Sequence[Float64[np.ndarray, "_corners 2"]],
-    sigma: Sequence[Float64[np.ndarray, " _corners"]],
+    relative_sigma: Sequence[Float64[np.ndarray, " _corners"]],
     poses: Sequence[BoardPose],
     noise: float,
 ) -> Float64[np.ndarray, " 3"]:
@@ -265,14 +265,14 @@ def update_bend(
         camera: the camera.
         corner_numbers: numbers of the corners in every image.
         pixels: pixels of the corners in every image [px].
-        sigma: standard deviation of every corner relative to the median.
+        relative_sigma: standard deviation of every corner relative to the median.
         poses: poses of the board in every image.
         noise: standard deviation of u and v of a corner of median deviation [px].
     """
     of_corner, corners = bend_shapes(board), bent_corners(board, bend)
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(_SHAPES), -prior * bend[:, None]], 1)]
-    for number, at, deviation, pose in zip(corner_numbers, pixels, sigma, poses, strict=True):
+    for number, at, deviation, pose in zip(corner_numbers, pixels, relative_sigma, poses, strict=True):
         residual, J, point_jacobian = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
         height_jacobian = (point_jacobian @ pose.R[:, 2])[..., None] * of_corner[number][:, None]
         columns = np.concatenate([J, height_jacobian, residual[..., None]], -1)

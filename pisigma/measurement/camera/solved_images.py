@@ -90,7 +90,7 @@ class SolvedImages:
 
 def solve_images(
     camera: Camera,
-    sigma: Float64[np.ndarray, " 9"],
+    prior_sigma: Float64[np.ndarray, " 9"],
     solve: Callable[[Camera], Sequence[BoardPose]],
     loss: AbstractLoss,
     source: str,
@@ -102,7 +102,7 @@ def solve_images(
 
     Args:
         camera: the camera of the file.
-        sigma: prior standard deviations, see `prior_sigmas`.
+        prior_sigma: prior standard deviations, see `prior_sigmas`.
         solve: function that returns the poses for given intrinsics.
         loss: robust loss of the corners, for their noise.
         source: name of the images in messages.
@@ -113,8 +113,8 @@ def solve_images(
     present = camera
     for _ in range(MAX_ITERATIONS):
         poses = tuple(solve(present))
-        solved = SolvedImages(camera, present, sigma, poses, corner_noise(poses, loss))
-        if not sigma.any():
+        solved = SolvedImages(camera, present, prior_sigma, poses, corner_noise(poses, loss))
+        if not prior_sigma.any():
             return solved
         root, mean = intrinsics_information(solved.intrinsics)
         if np.linalg.norm(root @ (mean - present.intrinsics)) < _CONVERGENCE_TOLERANCE:

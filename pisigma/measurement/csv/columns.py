@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, choice_remedy
 from pisigma.files.output_file import write_atomically
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, text_columns
@@ -167,7 +167,7 @@ def column_choices(name: str) -> str:
     meant = name.lower()
     if re.fullmatch(r"q[1-9][0-9]?", meant):  # degrees, because most joints are revolute
         meant += "_deg"
-    return nearest_choice(meant, (*joints, *_columns(), *(f"{start}{joint}" for start in PER_JOINT.values())))
+    return choice_remedy(meant, (*joints, *_columns(), *(f"{start}{joint}" for start in PER_JOINT.values())))
 
 
 def quoted_names(columns: Iterable[Column]) -> str:

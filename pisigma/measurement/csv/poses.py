@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, choice_remedy
 from pisigma.files.input_file import open_input
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted_names
 from pisigma.measurement.csv.header import check_separators
@@ -241,7 +241,7 @@ def _columns(header: Sequence[str], place: Place) -> dict[str, tuple[int, Column
                 expected="a column of a pose",
                 value=name,
                 at=replace(place, column=name),
-                remedy=f"{nearest_choice(name, valid)} Lengths may also be in m.",
+                remedy=f"{choice_remedy(name, valid)} Lengths may also be in m.",
             )
         if column.quantity in columns:
             raise MeasurementError(

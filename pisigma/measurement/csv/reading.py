@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Phrase, Place, check_choice, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, check_choice, choice_remedy
 from pisigma.measurement.csv.columns import (
     CORNERS,
     PRISMATIC_UNITS,
@@ -256,7 +256,7 @@ def text_column(table: Table, name: str) -> list[str]:
         raise MeasurementError(
             "the column is missing",
             at=replace(table.header_place, column=name),
-            remedy=nearest_choice(name, table.header),
+            remedy=choice_remedy(name, table.header),
         )
     index = table.header.index(name)
     return [fields[index].strip() if index < len(fields) else "" for fields in table.records]

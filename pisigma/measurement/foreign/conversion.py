@@ -32,7 +32,12 @@ from pisigma.measurement.foreign.quantities import (
     measurement_column,
 )
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
-from pisigma.measurement.foreign.time_stamps import ambiguous_date, day_first, has_ambiguous_date, iso_day
+from pisigma.measurement.foreign.time_stamps import (
+    ambiguous_date_error,
+    day_first,
+    has_ambiguous_date,
+    iso_day,
+)
 from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, to_file_unit
 from pisigma.robot.se3 import quaternion_from_rotation
 
@@ -59,7 +64,7 @@ class ConvertedRows:
         return tuple(zip(self.origins or (self.source,) * len(self.lines), self.lines, strict=True))
 
 
-def check_complete(mapping: FileMapping) -> None:
+def check_quantities_and_units(mapping: FileMapping) -> None:
     """Check that quantities of the kept columns are unique, and that their units are stated and agree.
 
     Raises:
@@ -133,9 +138,9 @@ def convert_rows(mapping: FileMapping) -> ConvertedRows:
     """Convert the rows of a file.
 
     Raises:
-        MeasurementError: see `check_complete`, or the values of a row are not a rotation.
+        MeasurementError: see `check_quantities_and_units`, or the values of a row are not a rotation.
     """
-    check_complete(mapping)
+    check_quantities_and_units(mapping)
     file, cells = mapping.file, {}
     for quantity, column in mapping.quantities.items():
         if quantity in KEYS:
@@ -195,7 +200,7 @@ def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
     for line, text in zip(file.lines, texts, strict=True):
         day = "" if is_missing(text) else iso_day(text, first)
         if day is None and has_ambiguous_date(text) and iso_day(text, True) is not None:
-            raise ambiguous_date(Place(file.source, line, column.heading), text)
+            raise ambiguous_date_error(Place(file.source, line, column.heading), text)
         dates.append(text if day is None else day)
     return tuple(dates)
 

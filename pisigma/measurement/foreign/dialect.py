@@ -136,7 +136,9 @@ class Dialect:
         return self.numbers.text(cell) is not None
 
 
-def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
+def detect_dialect(
+    lines: Sequence[tuple[int, str]], source: str, decimal_sign: Decimal | None = None
+) -> Dialect:
     """Find the separator and the decimal sign for which most cells of most lines are numbers.
 
     Of equally good formats, the first is returned, in the order of `_SEPARATORS` and with decimal points first.
@@ -144,7 +146,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
     Args:
         lines: line numbers and texts of the lines of the file that are not blank.
         source: the file, for messages.
-        decimal: the decimal sign, if it is stated.
+        decimal_sign: the decimal sign, if it is stated.
 
     Raises:
         MeasurementError: no format results in a table of numbers, or the decimal sign is ambiguous.
@@ -152,7 +154,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
     half = _SAMPLED_LINES // 2
     sampled = [*lines[:half], *lines[half:][-half:]]
     sample = [line for _, line in sampled]
-    signs = (decimal,) if decimal else get_args(Decimal)
+    signs = (decimal_sign,) if decimal_sign else get_args(Decimal)
     choices = [
         Dialect(separator, NumberFormat(sign)) for separator, sign in itertools.product(_SEPARATORS, signs)
     ]
@@ -166,7 +168,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
             remedy="separate cells with tabs, semicolons, commas or spaces",
         )
     dialect = choices[scores.index(best)]
-    if decimal is None:
+    if decimal_sign is None:
         rows = [(number, row) for number, line in sampled if dialect.is_row(row := dialect.split(line))]
         _check_decimal(dialect, rows, source)
     return dialect

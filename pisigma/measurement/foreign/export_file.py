@@ -83,13 +83,13 @@ class ExportFile:
 
 
 def read_export(
-    path: str | os.PathLike[str], decimal: Decimal | None = None, max_bytes: int = MAX_BYTES
+    path: str | os.PathLike[str], decimal_sign: Decimal | None = None, max_bytes: int = MAX_BYTES
 ) -> ExportFile:
     """Read an export, recognising encoding, separator, decimal sign, headings, unit row and comments.
 
     Args:
         path: the file.
-        decimal: the decimal sign, if it is stated.
+        decimal_sign: the decimal sign, if it is stated.
         max_bytes: largest size of the file [bytes].
 
     Raises:
@@ -98,7 +98,7 @@ def read_export(
     """
     source = make_printable(str(path), cut=False)
     lines = _lines_of(decode_text(read_input(path, MeasurementError, max_bytes), source), source)
-    dialect = detect_dialect(lines, source, decimal)
+    dialect = detect_dialect(lines, source, decimal_sign)
     cells = [dialect.split(line) for _, line in lines]
     width = Counter(len(row) for row in cells if dialect.is_row(row)).most_common(1)[0][0]
     is_row = [len(row) == width and dialect.is_row(row) for row in cells]

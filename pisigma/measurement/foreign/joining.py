@@ -13,8 +13,8 @@ from pisigma.measurement.foreign.accounting import FileLine, LeftOutRow
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
 from pisigma.measurement.foreign.time_stamps import (
-    ambiguous_date,
-    check_restarts,
+    ambiguous_date_error,
+    check_same_recording,
     date_of,
     day_first,
     has_ambiguous_date,
@@ -215,8 +215,8 @@ def _number_of(name: str) -> str:
 
 def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> Int64[np.ndarray, " rows"]:
     times, logged = _times(measured, joints), _times(joints, measured)
-    check_restarts(times, within, measured.source, measured.lines)
-    check_restarts(logged, within, joints.source, joints.lines)
+    check_same_recording(times, within, measured.source, measured.lines)
+    check_same_recording(logged, within, joints.source, joints.lines)
     order = np.argsort(logged, kind="stable")
     after = np.clip(np.searchsorted(logged[order], times), min(1, len(order) - 1), len(order) - 1)
     before = np.maximum(after - 1, 0)  # the nearest stamp is one of the two neighbours in the sorted log
@@ -239,7 +239,7 @@ def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " r
     for row, text in enumerate(texts):
         seconds = seconds_of(text, first)
         if seconds is None and has_ambiguous_date(text) and seconds_of(text, True) is not None:
-            raise ambiguous_date(Place(rows.source, rows.lines[row]), text)
+            raise ambiguous_date_error(Place(rows.source, rows.lines[row]), text)
         if seconds is None:
             raise MeasurementError(
                 expected="a time stamp such as 12.5, 10:31:02.5, 10:31:02 PM or 2026-03-02 10:31:02.5",

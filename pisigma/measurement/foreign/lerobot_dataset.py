@@ -145,7 +145,7 @@ def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
     return tuple(names)
 
 
-def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
+def position_indices_of_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
     """Return the index of the position of every motor of an arm, by the name of the motor, in the order of the values.
 
     The positions are the values whose names end in ".pos" ("left_elbow_flex.pos" for motor "elbow_flex"); if there are
@@ -257,7 +257,7 @@ def read_joint_log(
             expected=f"the feature {STATE}", value=Phrase(", ".join(source.feature_names)), option="files"
         )
     names = source.feature_names[STATE]
-    motors = joint_motors(names, prefix)
+    motors = position_indices_of_motors(names, prefix)
     if not motors:
         raise MeasurementError(
             expected="positions of motors", value=Phrase(", ".join(names)), option="lerobot_prefix"

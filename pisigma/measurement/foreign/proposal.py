@@ -76,21 +76,23 @@ class Proposal:
         return names
 
     def assign_columns(
-        self, group: Mapping[str, str], names: Mapping[str, list[int]], value_kind: _Side, reason: str
+        self, quantities: Mapping[str, str], indices: Mapping[str, list[int]], value_kind: _Side, reason: str
     ) -> None:
         """Map columns by their names; of commanded and measured columns, keep only one kind."""
-        for name, quantity in group.items():
-            sides = {self.headings[index].value_kind for index in names[name]}
+        for name, quantity in quantities.items():
+            sides = {self.headings[index].value_kind for index in indices[name]}
             chosen = next(one for one in (value_kind, "", *sides) if one in sides)
-            for index in names[name]:
+            for index in indices[name]:
                 if self.headings[index].value_kind == chosen:
                     self.set_quantity(index, quantity, reason)
                 else:
                     self.set_quantity(index, LEFT_OUT, f"the {value_kind} values are used")
 
-    def leave_out(self, group: Mapping[str, object], names: Mapping[str, list[int]], reason: str) -> None:
+    def leave_out(
+        self, column_names: Mapping[str, object], indices: Mapping[str, list[int]], reason: str
+    ) -> None:
         """Leave out columns by their names."""
-        for index in (index for name in group for index in names.get(name, ())):
+        for index in (index for name in column_names for index in indices.get(name, ())):
             self.set_quantity(index, LEFT_OUT, reason)
 
 
@@ -188,7 +190,7 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
         numbers = file.numbers(index)
         if index in proposal.columns or quantity == "point" or len(numbers) < len(file.records):
             continue
-        if not is_like_time(numbers, is_first=not index):
+        if not is_like_time(numbers, is_first_column=not index):
             continue
         unit = "mm" if quantity in POSITION else "deg"
         raise MeasurementError(

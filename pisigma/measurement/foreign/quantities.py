@@ -4,7 +4,7 @@ import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, choice_remedy
 from pisigma.measurement.csv.columns import RPY, find_column, number_fields
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind
@@ -146,7 +146,7 @@ def parse_target(text: str, heading: str) -> ColumnTarget:
         f"unknown target '{text}' of the column '{heading}'",
         option="--map",
         value=text,
-        remedy=nearest_choice(text, choices),
+        remedy=choice_remedy(text, choices),
     )
 
 

@@ -33,7 +33,7 @@ _MIN_RANGE = 100.0
 """Range of a column's values relative to their rounding above which it distinguishes a mean from a measurement."""
 
 
-def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dict[int, str]:
+def summary_rows(records: Sequence[Sequence[str]], number_format: NumberFormat) -> dict[int, str]:
     """Find rows that summarise other rows.
 
     A row is a summary if one of its cells names a statistic, or if it precedes or follows all other rows and contains
@@ -42,7 +42,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
 
     Args:
         records: cells of the rows.
-        numbers: format of numbers.
+        number_format: format of numbers.
 
     Returns:
         The reason why a row is a summary, by row index.
@@ -51,7 +51,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
     is_mode = len(named) == len(records) or (
         set(named.values()) <= _AVERAGES
         and len(named) > max(1.0, _MAX_SHARE * len(records))
-        and not _holds_means(records, numbers, named)
+        and not _holds_means(records, number_format, named)
     )
     named = {} if is_mode else named
     found = {
@@ -59,7 +59,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
         for row, name in named.items()
     }
     unnamed = [row for row in range(len(records)) if row not in named]
-    texts = [[numbers.text(cell) for cell in records[row]] for row in unnamed]
+    texts = [[number_format.text(cell) for cell in records[row]] for row in unnamed]
     after = _count_statistics(texts)
     before = 0 if after else _count_statistics(texts[::-1])
     why = "the row is the mean, or another statistic, of the rows"

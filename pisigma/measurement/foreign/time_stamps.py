@@ -91,7 +91,7 @@ def has_ambiguous_date(text: str) -> bool:
     return bool(match and _is_open(match) and match[1] != match[3])
 
 
-def ambiguous_date(at: Place, text: str) -> MeasurementError:
+def ambiguous_date_error(at: Place, text: str) -> MeasurementError:
     """Return the exception for a date that may begin with the day or with the month."""
     return MeasurementError(
         expected="a date with a known order of day and month",
@@ -101,7 +101,7 @@ def ambiguous_date(at: Place, text: str) -> MeasurementError:
     )
 
 
-def check_restarts(
+def check_same_recording(
     times: Float64[np.ndarray, " rows"], max_time_difference: float, source: str, lines: Sequence[int]
 ) -> None:
     """Check that rows close in time belong to one recording, because the wrong recording might otherwise be joined.
@@ -130,17 +130,17 @@ def check_restarts(
         )
 
 
-def is_like_time(numbers: Sequence[float], is_first: bool) -> bool:
+def is_like_time(numbers: Sequence[float], is_first_column: bool) -> bool:
     """Return whether numbers rise or fall from row to row more often than by chance, apart from changes of the clock.
 
     Args:
         numbers: numbers of a column.
-        is_first: whether it is the first column, of which `_MIN_RISING` numbers that all rise are sufficient.
+        is_first_column: whether it is the first column, of which `_MIN_RISING` numbers that all rise are sufficient.
     """
     steps = [after - before for before, after in itertools.pairwise(numbers)]
     up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
     few, most = sorted((up, down))
-    if most < _MIN_CHANGES * len(steps) or len(numbers) < (_MIN_RISING if is_first else _MIN_ORDERED):
+    if most < _MIN_CHANGES * len(steps) or len(numbers) < (_MIN_RISING if is_first_column else _MIN_ORDERED):
         return False
     if len(numbers) >= _MANY:
         return few <= _MAX_REVERSED * most

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, choice_remedy
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
 _MIN_ROWS = 3
@@ -114,7 +114,7 @@ def parse_units(text: str) -> dict[UnitKind, str]:
         symbol = unit_symbol(word)
         if not symbol:
             raise MeasurementError(
-                f"unknown unit '{word}'", option="--unit", value=word, remedy=nearest_choice(word, UNITS)
+                f"unknown unit '{word}'", option="--unit", value=word, remedy=choice_remedy(word, UNITS)
             )
         if units.setdefault(UNITS[symbol].kind, symbol) != symbol:
             raise MeasurementError(option="--unit", expected=f"one unit of {UNITS[symbol].kind}", value=text)

@@ -194,7 +194,7 @@ class CornerSensor(AbstractSensor):
         return rotation_difference(self.rotation[..., rows], motion.rotation)
 
 
-def position_sigmas(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+def relative_position_sigmas(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Return standard deviations of positions, relative to the noise of a corner; NaN in rows of other sensors."""
     weight = _scaled_weights(measurements)
     from_image = measurements.is_measured("corner")
@@ -244,15 +244,17 @@ def as_poses(
     )
 
 
-def with_fixed_intrinsics(measurements: Measurements, length: float, angle: float) -> Measurements:
+def with_fixed_intrinsics(
+    measurements: Measurements, position_sigma: float, rotation_sigma: float
+) -> Measurements:
     """Return rows of images with fixed intrinsics and board scale, and with additional noise in their poses.
 
     Args:
         measurements: the rows.
-        length: standard deviation of the additional noise of each coordinate [m].
-        angle: standard deviation of the additional noise of the rotation about each axis [rad].
+        position_sigma: standard deviation of the additional noise of each coordinate [m].
+        rotation_sigma: standard deviation of the additional noise of the rotation about each axis [rad].
     """
-    added = np.diag([length**2] * 3 + [angle**2] * 3)
+    added = np.diag([position_sigma**2] * 3 + [rotation_sigma**2] * 3)
     noisy = with_pose_noise(measurements, np.broadcast_to(added, (measurements.rows, 6, 6)))
     if noisy is measurements:
         return measurements

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, Place, nearest_choice
+from pisigma.files.errors import IdentificationError, Place, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
@@ -142,7 +142,7 @@ class AnchorSensor(AbstractSensor):
                 f"anchor '{owner}' was not calibrated and its position is not given",
                 at=measurements.place_of(row, "anchor"),
                 value=owner,
-                remedy=nearest_choice(owner, calibrated_owners),
+                remedy=choice_remedy(owner, calibrated_owners),
             )
         return torch.cat([position, position.new_zeros(1)])
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import SensorReadings
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
@@ -252,7 +252,7 @@ class AbstractSensor(ABC):
             f"'{owner}' of the sensor '{cls.name}' was not calibrated",
             at=measurements.place_of(row),
             value=owner,
-            remedy=nearest_choice(owner, calibrated_owners),
+            remedy=choice_remedy(owner, calibrated_owners),
         )
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "AbstractSensor":

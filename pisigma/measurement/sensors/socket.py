@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, Phrase, Place, nearest_choice
+from pisigma.files.errors import IdentificationError, Phrase, Place, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
@@ -225,7 +225,7 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
                 option="socket_distances",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, order),
+                remedy=choice_remedy(name, order),
             )
     if one == other or not distance > 0:
         raise IdentificationError(
@@ -244,7 +244,7 @@ def group_means(
     return total / torch.bincount(group, minlength=group_count).clamp(min=1)[:, None]
 
 
-def matching_sockets(
+def expand_socket_names(
     distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
 ) -> dict[tuple[str, str], float]:
     """Return distances by names of sockets in the data, with "*" expanded; see `CalibrationSettings`."""

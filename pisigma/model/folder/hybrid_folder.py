@@ -29,8 +29,8 @@ from pisigma.joint_correction.registry import feature_from
 from pisigma.measurement.sensors.sensor import UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.folder.model_document import (
+    InconsistentFolderError,
     LearnedSection,
-    MisfitError,
     ModelDocument,
     UncertaintySection,
     UnknownsSection,
@@ -111,7 +111,7 @@ def check_size(document: ModelDocument, robot: Robot, stored_values: int) -> Non
         stored_values: number of values in the weights file.
 
     Raises:
-        MisfitError: the description requires more values.
+        InconsistentFolderError: the description requires more values.
     """
     required = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
     if (learned := document.learned) is not None:
@@ -120,7 +120,7 @@ def check_size(document: ModelDocument, robot: Robot, stored_values: int) -> Non
     if document.uncertainty is not None and InputProducts.name in document.uncertainty.features:
         required += robot.dof * math.comb(robot.dof, 2)
     if required > stored_values:
-        raise MisfitError(
+        raise InconsistentFolderError(
             f"the description requires at least {required:,} weights, but the file has {stored_values:,} numbers",
             column="orders",
             value=required,
@@ -167,13 +167,15 @@ def with_hybrid(
         tensors: tensors with the shapes of `hybrid_shapes`.
 
     Raises:
-        MisfitError: the parts do not fit together.
+        InconsistentFolderError: the parts do not fit together.
     """
     learned, known = document.learned, document.uncertainty
     if learned is None and known is None:
         return model
     if model.calibrated is None:
-        raise MisfitError("a hybrid calibration requires the calibrated robot", column="calibrated")
+        raise InconsistentFolderError(
+            "a hybrid calibration requires the calibrated robot", column="calibrated"
+        )
     nominal = _with_limits(_exact("drawn", model.robot, tensors, ("dh",)), tensors["drawn.limits"])
     calibrated = _exact("calibrated", replace(model.calibrated, rows=nominal.rows), tensors, _GEOMETRY)
     robot = nominal.with_geometry(base=calibrated.base, tool=calibrated.tool)
@@ -181,7 +183,7 @@ def with_hybrid(
     place = (calibrated, model.bases, model.tools)
     if learned is not None:
         if (list(learned.bases), list(learned.tools)) != (list(model.bases), list(model.tools)):
-            raise MisfitError(
+            raise InconsistentFolderError(
                 "the frames or targets of the learned part differ from those of the geometric part",
                 column="learned",
             )
@@ -209,7 +211,7 @@ def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequenc
     values = {part: tensors[f"{name}.{part}"].numpy() for part in _GEOMETRY}
     for part in same:
         if np.abs(values[part] - getattr(robot, part)).max() > _ROUNDING:
-            raise MisfitError(
+            raise InconsistentFolderError(
                 f"the tensor '{name}.{part}' differs from the geometry in the description",
                 file=WEIGHTS,
                 value=f"{name}.{part}",
@@ -221,7 +223,7 @@ def _with_limits(robot: Robot, limits: Tensor) -> Robot:
     """Return the robot with the exact joint limits of the weights file."""
     limited = _limited(robot)
     if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > _ROUNDING:
-        raise MisfitError(
+        raise InconsistentFolderError(
             "the tensor 'drawn.limits' differs from the joint limits in the description",
             file=WEIGHTS,
             value="drawn.limits",
@@ -253,11 +255,11 @@ def _correction(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Ten
 def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
     joint, middle, half = (tensors[f"coverage.{name}"] for name in ("joint", "middle", "half"))
     if not len(joint) == len(middle) == len(half):
-        raise MisfitError(
+        raise InconsistentFolderError(
             "the coverage has intervals without joint, middle or half width", file=WEIGHTS, value="coverage"
         )
     if set(joint.tolist()) != set(range(robot.dof)) or bool((half < 0).any()):
-        raise MisfitError(
+        raise InconsistentFolderError(
             "the coverage must have an interval of width >= 0 for every joint of the robot, and no other",
             file=WEIGHTS,
             value="coverage.joint",
@@ -278,9 +280,11 @@ def _uncertainty(
     robot, bases, tools = place
     groups = [_unknowns(section) for section in known.unknowns]
     if len({group.name for group in groups}) < len(groups):
-        raise MisfitError("a group of sensor unknowns appears twice", column="uncertainty.unknowns")
+        raise InconsistentFolderError(
+            "a group of sensor unknowns appears twice", column="uncertainty.unknowns"
+        )
     if elsewhere := {frame for group in groups for frame in group.frames} - {*bases}:
-        raise MisfitError(
+        raise InconsistentFolderError(
             f"sensor unknowns refer to the frame '{min(elsewhere)}', which the model does not have",
             column="uncertainty.unknowns",
             value=min(elsewhere),
@@ -288,7 +292,7 @@ def _uncertainty(
     space = ParameterSpace(nominal, tuple(bases), tuple(tools), tuple(groups))
     count, free = len(space.parameters), list(known.free)
     if sorted(set(free)) != free or (free and free[-1] >= count):
-        raise MisfitError(
+        raise InconsistentFolderError(
             f"expected increasing indices of free parameters below {count}, got {free}",
             column="uncertainty.free",
             value=free,
@@ -300,7 +304,7 @@ def _uncertainty(
     for own in space.unknowns:
         wrong = {len(values) for values in unknowns.get(own.name, {}).values()} - {len(own.columns)}
         if wrong:
-            raise MisfitError(
+            raise InconsistentFolderError(
                 f"expected {len(own.columns)} values of every {own.name}, got {(count := wrong.pop())}",
                 column="uncertainty.values",
                 value=count,
@@ -327,7 +331,7 @@ def _root(
         content = tensors["uncertainty.numbers"].numpy().tobytes()
         rounded = RoundedRoot.unpacked(content, rows)
     except ValueError as problem:
-        raise MisfitError(str(problem), file=WEIGHTS, value="uncertainty.numbers") from None
+        raise InconsistentFolderError(str(problem), file=WEIGHTS, value="uncertainty.numbers") from None
     return CovarianceRoot.from_rounded(rounded.with_exact_unknowns(uncertain, count))
 
 
@@ -345,7 +349,7 @@ def _unknowns_section(group: UnknownGroup) -> dict[str, object]:
 
 def _unknowns(section: UnknownsSection) -> UnknownGroup:
     if len(section.frames) not in (0, len(section.owners)):
-        raise MisfitError(
+        raise InconsistentFolderError(
             f"expected one frame for every {section.name}, got {len(section.frames)}",
             column="uncertainty.unknowns",
             value=len(section.frames),
@@ -364,14 +368,14 @@ def _weighted(known: UncertaintySection, correction: JointCorrection | None) -> 
     """Return the features whose weights are in the root, including the input products of the product units.
 
     Raises:
-        MisfitError: the features differ from those of the learned part.
+        InconsistentFolderError: the features differ from those of the learned part.
     """
     learned = () if correction is None else correction.features
     of_name = {chosen.name: chosen for chosen in learned}
     if correction is not None and InputProducts.name in known.features:
         of_name[InputProducts.name] = InputProducts(correction.robot)
     if sorted(known.features) != sorted(of_name):
-        raise MisfitError(
+        raise InconsistentFolderError(
             f"the uncertainty refers to the features {', '.join(known.features) or 'none'}, "
             f"but the learned part has {', '.join(chosen.name for chosen in learned) or 'none'}",
             column="uncertainty.features",

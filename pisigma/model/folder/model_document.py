@@ -28,7 +28,7 @@ _Frame = tuple[float, float, float, float, float, float]
 _Feature = Annotated[FeatureSection, PlainValidator(feature_section)]
 
 
-class MisfitError(ValueError):
+class InconsistentFolderError(ValueError):
     """Error for parts of a model folder that do not fit together; `load_model` raises a `ModelError` with its fields.
 
     Attributes:

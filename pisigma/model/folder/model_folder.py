@@ -14,7 +14,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from pisigma.files.errors import ModelError, PisigmaError, Place, nearest_choice
+from pisigma.files.errors import ModelError, PisigmaError, Place, choice_remedy
 from pisigma.files.model_files import COMPILED, DESCRIPTION, DRAWING, WEIGHTS, content_hash, read_model_file
 from pisigma.measurement.copies import ROW_READINGS, ROW_STEPS, RowValues
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -30,7 +30,7 @@ from pisigma.model.folder.hybrid_folder import (
     with_hybrid,
 )
 from pisigma.model.folder.model_document import (
-    MisfitError,
+    InconsistentFolderError,
     ModelDocument,
     document_text,
     read_document,
@@ -139,7 +139,7 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
         return _build_model(document, tensors, drawing or None)
     except (PisigmaError, ValueError) as problem:
         reason = " ".join(str(problem).rstrip(".").split())
-        file = problem.file if isinstance(problem, MisfitError) else DESCRIPTION
+        file = problem.file if isinstance(problem, InconsistentFolderError) else DESCRIPTION
         raise ModelError(
             f"{WEIGHTS} and {DESCRIPTION} do not fit together: {reason}",
             value=getattr(problem, "value", None),
@@ -259,7 +259,9 @@ def _build_model(
 
 def _training_values(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
-        raise MisfitError("the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0])
+        raise InconsistentFolderError(
+            "the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0]
+        )
     return RowValues.stored_values(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 
 
@@ -268,11 +270,11 @@ def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
         return None
     calibrated = Robot(*document.calibrated.to_fields()._replace(urdf=robot.urdf))
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
-        raise MisfitError(
+        raise InconsistentFolderError(
             "the rows of the calibrated robot differ from those of the nominal one", column="calibrated"
         )
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):
-        raise MisfitError(
+        raise InconsistentFolderError(
             "the base or tool of the calibrated robot differs from the nominal one", column="calibrated"
         )
     return calibrated
@@ -282,14 +284,14 @@ def _check_branches(robot: Robot, branches: tuple[str, ...]) -> None:
     solver = closed_form_solver(robot)
     for name in branches:
         if solver is None:
-            raise MisfitError(
+            raise InconsistentFolderError(
                 f"branch '{name}' is stated, but robot '{robot.name}' has no closed-form inverse",
                 column="branches",
                 value=name,
             )
         if name not in solver.branches:
-            raise MisfitError(
-                f"robot '{robot.name}' has no branch '{name}'; {nearest_choice(name, solver.branches)}",
+            raise InconsistentFolderError(
+                f"robot '{robot.name}' has no branch '{name}'; {choice_remedy(name, solver.branches)}",
                 column="branches",
                 value=name,
             )
@@ -302,8 +304,8 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
     for section in document.network:
         for name in section.joints:
             if name not in names:
-                raise MisfitError(
-                    f"the network corrects the unknown joint '{name}'; {nearest_choice(name, names)}",
+                raise InconsistentFolderError(
+                    f"the network corrects the unknown joint '{name}'; {choice_remedy(name, names)}",
                     column="network",
                     value=name,
                 )
@@ -317,7 +319,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
     """Check that the tensors are exactly the expected ones; None in a shape stands for any length."""
     for name in sorted(set(tensors) ^ set(expected)):
         problem = "unknown" if name in tensors else "missing"
-        raise MisfitError(f"the tensor '{name}' is {problem}", file=WEIGHTS, value=name)
+        raise InconsistentFolderError(f"the tensor '{name}' is {problem}", file=WEIGHTS, value=name)
     for name, shape in expected.items():
         value = tensors[name]
         fits = len(shape) == value.ndim and all(
@@ -325,7 +327,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
         )
         if not fits:
             wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
-            raise MisfitError(
+            raise InconsistentFolderError(
                 f"expected shape {wanted} for the tensor '{name}', got {tuple(value.shape)}",
                 file=WEIGHTS,
                 value=tuple(value.shape),
@@ -333,7 +335,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
         dtype = DTYPES.get(name, torch.float64)
         if value.dtype != dtype:
             kind = str(dtype).removeprefix("torch.")
-            raise MisfitError(
+            raise InconsistentFolderError(
                 f"expected type {kind} for the tensor '{name}', got {str(value.dtype).removeprefix('torch.')}",
                 file=WEIGHTS,
                 value=value.dtype,

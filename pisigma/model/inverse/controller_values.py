@@ -30,7 +30,7 @@ Motion = Callable[[Values], tuple[Any, Any]]
 """Function that returns the pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm at the controller's values."""
 
 
-class ControllerValues:
+class ControllerValuesSolver:
     """Solver that finds DH values within wide limits and wraps the solutions into the controller's limits.
 
     Full turns of coupled joints change several of the controller's values. If a solution cannot be wrapped into the
@@ -45,7 +45,7 @@ class ControllerValues:
         """Store the inverse kinematics in DH values, and the coupling between these and the controller's values."""
         self.ik, self.coupling = ik, coupling
 
-    def with_axes(self, axes: TaskAxes) -> "ControllerValues":
+    def with_axes(self, axes: TaskAxes) -> "ControllerValuesSolver":
         """Return a copy in which other axes of the tool are constrained.
 
         Raises:
@@ -58,7 +58,7 @@ class ControllerValues:
                 option="ignore_axes",
                 remedy="omit ignore_axes and the tolerances",
             )
-        return ControllerValues(self.ik.with_axes(axes), self.coupling)
+        return ControllerValuesSolver(self.ik.with_axes(axes), self.coupling)
 
     def solve(self, T: Any, near: Any, owner: Any, branch: str | None = None, **options: Any) -> Solution:
         """Find the controller's values for poses; see `CorrectedIK.__call__`.
@@ -87,11 +87,13 @@ class ControllerValues:
         """Find the controller's values on every branch; see `CorrectedIK.all_branches`."""
         sides = options.get("approach")
         if self.coupling.has_passive_joints:
-            return self._solve_passive(T[..., None, :, :], None, owner).with_approach(sides, of_branches=True)
+            return self._solve_passive(T[..., None, :, :], None, owner).with_approach(
+                sides, has_branch_axis=True
+            )
         every = self.ik.all_branches(T, **self._with_dh_approach(options))
         q, _ = self._inside(np.asarray(as_array(every.q)), None)
         answer = self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
-        return answer.with_approach(sides, of_branches=True)
+        return answer.with_approach(sides, has_branch_axis=True)
 
     def forward(self, q: Any, approach: Any) -> Any:
         """Compute poses at the controller's values; see `CorrectedIK.forward`."""

@@ -46,7 +46,7 @@ class CorrectedIK(AbstractInverse):
         controller: conversion to the controller's values for coupled joints; None if there are none.
     """
 
-    controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
+    controller: "pisigma.model.inverse.controller_values.ControllerValuesSolver | None"
 
     def __init__(self, model: "pisigma.model.calibrated_model.CalibratedModel") -> None:
         """Prepare a model for calls.
@@ -67,11 +67,11 @@ class CorrectedIK(AbstractInverse):
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
         self.controller = None
         if model.robot.coupling is not None:
-            from pisigma.model.inverse.controller_values import ControllerValues
+            from pisigma.model.inverse.controller_values import ControllerValuesSolver
 
             axes = model.robot.axes
             of_joints = replace(model, robot=replace(model.robot, coupling=None))
-            self.controller = ControllerValues(CorrectedIK(of_joints), model.robot.coupling)
+            self.controller = ControllerValuesSolver(CorrectedIK(of_joints), model.robot.coupling)
             self.joints, self.limits = tuple(axis.name for axis in axes), model.robot.axis_limits
             self.revolute = np.array([axis.type == "revolute" for axis in axes])
 
@@ -186,7 +186,7 @@ class CorrectedIK(AbstractInverse):
         T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
         every = route.all_branches(T, approach=approach, is_float32=single, axes=self.task_axes)
-        return self._like(tensor, every, self.task_axes).with_approach(approach, of_branches=True)
+        return self._like(tensor, every, self.task_axes).with_approach(approach, has_branch_axis=True)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
@@ -351,10 +351,10 @@ class CorrectedIK(AbstractInverse):
         """Return solutions as tensors, with gradients if required, if the poses are tensors, otherwise as arrays."""
         if poses is None:
             return replace(solution.map(as_array), owner=self)
-        from pisigma.model.inverse.numeric_arm import as_tensor, like_poses
+        from pisigma.model.inverse.numeric_arm import as_tensor, in_type_of_poses
 
         tensors = replace(solution.map(as_tensor), owner=self)
-        return like_poses(tensors, poses, self.model if poses.requires_grad else None, axes)
+        return in_type_of_poses(tensors, poses, self.model if poses.requires_grad else None, axes)
 
 
 def load(folder: str | os.PathLike[str]) -> CorrectedIK:

@@ -174,7 +174,7 @@ def as_tensor(values: Any) -> Tensor:
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
 
 
-def like_poses(
+def in_type_of_poses(
     solution: Solution, poses: Float[Tensor, "*batch 4 4"], model: CalibratedModel | None, axes: TaskAxes
 ) -> Solution:
     """Return solutions with the dtype and device of the poses, and with gradients with respect to them.

@@ -316,7 +316,7 @@ def poses_halfway(T: Array, U: Array) -> Array:
     return middle
 
 
-def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolute: Array) -> Array:
+def choose_branches(q: Array, status: Array, jumps: Array, start_cost: Array, revolute: Array) -> Array:
     """Choose the branch of every pose by dynamic programming over all branches.
 
     The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside the joint limits costs as
@@ -326,7 +326,7 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
         q: `(poses, branches, dof)` solutions [rad or m]; NaN where a pose has none.
         status: `(poses, branches)`: `Status` of the solutions.
         jumps: `(poses - 1, branches)`: whether a step on the same branch is a jump.
-        first: `(branches,)` cost of a start on each branch [rad²].
+        start_cost: `(branches,)` cost of a start on each branch [rad²].
         revolute: `(dof,)` mask of the revolute joints.
 
     Returns:
@@ -335,7 +335,7 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
     poses, branches = status.shape
     nodes = np.where(status == Status.OUTSIDE_JOINT_LIMITS, _LIMITS, 0.0)
     nodes = np.where(np.isfinite(q).all(-1), nodes, _NONE)
-    cost, came = nodes[0] + first, np.zeros((poses, branches), dtype=np.int64)
+    cost, came = nodes[0] + start_cost, np.zeros((poses, branches), dtype=np.int64)
     for start in range(0, poses - 1, CHUNK):
         stop = min(start + CHUNK, poses - 1)
         moving = _transitions(q[start : stop + 1], jumps[start:stop], revolute)

@@ -154,16 +154,16 @@ class Solution:
         chosen = self.map(lambda values: values[index])
         return chosen if self.approach is None else replace(chosen, approach=self.approach[index])
 
-    def with_approach(self, approach: Any, of_branches: bool = False) -> "Solution":
+    def with_approach(self, approach: Any, has_branch_axis: bool = False) -> "Solution":
         """Return the solutions for directions of approach.
 
         Args:
             approach: `(*batch, dof)` or `(dof,)`; None if not stated.
-            of_branches: whether the solutions have an axis of branches after the batch axes.
+            has_branch_axis: whether the solutions have an axis of branches after the batch axes.
         """
         if approach is None:
             return self
-        stated = approach[..., None, :] if of_branches and np.ndim(approach) > 1 else approach
+        stated = approach[..., None, :] if has_branch_axis and np.ndim(approach) > 1 else approach
         return replace(self, approach=np.broadcast_to(stated, self.q.shape))
 
     def map(self, change: Callable[..., Any], *others: "Solution") -> "Solution":

@@ -109,7 +109,7 @@ class RowModel:
         rows: Measurements,
         sigma: float | None,
         kept: Bool[Tensor, " rows"],
-        earlier: "RowModel | None" = None,
+        model_with_setup: "RowModel | None" = None,
         kept_model: "RowModel | None" = None,
     ) -> "RowModel":
         """Return the model linearised at the base and tool that fit the kept rows.
@@ -119,14 +119,18 @@ class RowModel:
             rows: all rows.
             sigma: standard deviation of measured lengths if the rows state none [m]; None for `_USUAL_NOISE`.
             kept: rows to which base and tool are fitted.
-            earlier: a model of the same rows, whose setup is used again; None to make one.
+            model_with_setup: a model of the same rows, whose setup is used again; None to make one.
             kept_model: the model of the kept rows alone; None to make it.
 
         Raises:
             IdentificationError: there are too few rows for base and tool.
             PoseError: the joint values do not fit the robot.
         """
-        setup, design = _problem(robot, rows) if earlier is None else (earlier.setup, earlier.design)
+        setup, design = (
+            _problem(robot, rows)
+            if model_with_setup is None
+            else (model_with_setup.setup, model_with_setup.design)
+        )
         point, rounds = setup.start, LINEARISATIONS
         if not bool(kept.all()):
             kept_model = kept_model or RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])

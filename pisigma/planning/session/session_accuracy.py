@@ -43,9 +43,9 @@ class SessionAccuracy:
 
 def session_accuracy(
     plan: StoredPlan,
-    before: RobotPosterior,
+    prior: RobotPosterior,
     rows: Measurements,
-    check: Measurements | None,
+    test_rows: Measurements | None,
     task: Float64[Tensor, "tasks dof"],
     progress: Progress = lambda what: None,
 ) -> SessionAccuracy | None:
@@ -54,9 +54,9 @@ def session_accuracy(
     Args:
         plan: plan for a nominal robot, which is calibrated with the rows, or for a model, whose posterior is updated by
             their joint values alone.
-        before: prior of the session, including the instrument.
+        prior: prior of the session, including the instrument.
         rows: rows to calibrate with.
-        check: rows that test the calibration; None if there are none yet. They are not used with a model.
+        test_rows: rows that test the calibration; None if there are none yet. They are not used with a model.
         task: joint values at which the robot must be accurate [rad or m].
         progress: called with the name of each step.
     """
@@ -64,10 +64,10 @@ def session_accuracy(
         return None
     checked = (math.nan, math.nan)
     if plan.model is not None:
-        posterior = before.after_measuring(rows.q)
+        posterior = prior.after_measuring(rows.q)
     else:
         try:
-            posterior, checked = _calibrated(plan.arm.robot, before, rows, check, progress)
+            posterior, checked = _calibrated(plan.arm.robot, prior, rows, test_rows, progress)
         except (IdentificationError, MeasurementError):
             return None
     D = posterior.tool_derivatives(task)
@@ -124,7 +124,7 @@ def expected_accuracy(
     poses: Float64[Tensor, "poses dof"],
     candidates: Float64[Tensor, "candidates dof"],
     task: Float64[Tensor, "tasks dof"],
-    step: int,
+    poses_per_point: int,
 ) -> tuple[AccuracyPoint, ...]:
     """Predict the accuracy after the remaining poses, and after the same number of random candidates.
 
@@ -134,9 +134,9 @@ def expected_accuracy(
         poses: joint values of the remaining poses, beginning with the next [rad or m].
         candidates: joint values of poses that could be measured instead [rad or m].
         task: joint values at which the robot must be accurate [rad or m].
-        step: number of poses between two points of the curve.
+        poses_per_point: number of poses between two points of the curve.
     """
-    counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
+    counts = [*range(poses_per_point, len(poses), poses_per_point), len(poses)] if len(poses) else []
     both = torch.cat([poses, candidates])
     points = accuracy_curve(
         posterior.sensitivities(both), posterior.tool_derivatives(task), torch.arange(len(poses)), counts

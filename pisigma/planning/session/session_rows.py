@@ -211,7 +211,7 @@ class FurtherPoses:
     def replan(
         self,
         plan: StoredPlan,
-        poses: int,
+        pose_count: int,
         accuracy_so_far: SessionAccuracy,
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
@@ -220,7 +220,7 @@ class FurtherPoses:
 
         Args:
             plan: the current plan.
-            poses: total number of poses to calibrate with.
+            pose_count: total number of poses to calibrate with.
             accuracy_so_far: posterior and accuracy given the rows so far.
             measured: joint values of the rows in use [rad or m].
             remaining: indices of the remaining poses, beginning with the next.
@@ -230,7 +230,7 @@ class FurtherPoses:
         """
         first = remaining[:1]
         check = remaining[1:][plan.check[remaining[1:]]]
-        count = poses - accuracy_so_far.point.poses - int((~plan.check[first]).sum())
+        count = pose_count - accuracy_so_far.point.poses - int((~plan.check[first]).sum())
         new = self._new(plan, torch.cat([measured, plan.q[first]]))
         posterior = accuracy_so_far.posterior
         if not len(first) or not 0 < count <= len(new):

@@ -9,14 +9,14 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.files.errors import PlanningError, RecipeError, nearest_choice
+from pisigma.files.errors import PlanningError, RecipeError, choice_remedy
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, Limits
 from pisigma.robot.row import BoundedFloat
 from pisigma.robot.se3 import rotation_from_zyx, transform_from_xyz_zyx, xyz_zyx_from_transform
-from pisigma.simulation.errors.source import stated_joints
+from pisigma.simulation.errors.source import values_by_joint_index
 
 Positive = Annotated[BoundedFloat, Field(gt=0)]
 NotNegative = Annotated[BoundedFloat, Field(ge=0)]
@@ -46,7 +46,9 @@ class JointSection(Section):
             PlanningError: a joint's range is empty.
         """
         fields = ("limits_deg", "limits_mm")
-        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", by_axis_name=True)
+        stated = values_by_joint_index(
+            robot, self.limits_deg, self.limits_mm, fields, "joints", by_axis_name=True
+        )
         limits = robot.axis_limits
         for index, joint in enumerate(robot.axes):
             to_si = (
@@ -328,7 +330,7 @@ def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surrounding
                 f"robot '{robot.name}' has no row '{name}'",
                 value=name,
                 at=place_of_key(path, ("links", "radii_mm", name)),
-                remedy=nearest_choice(name, names),
+                remedy=choice_remedy(name, names),
             )
     try:
         surroundings.joints.limits(robot)

@@ -19,14 +19,14 @@ from pisigma.reporting.page.wording import TITLES, advice_for, dependence_text, 
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.held_out_rows import read_held_out
-from pisigma.validation.held_out.judged_rows import JudgedRows, rows_of_file, rows_of_folder
+from pisigma.validation.held_out.judged_rows import JudgedRows, judge_rows_of_file, judged_rows_of_folder
 from pisigma.validation.report.accuracy import (
     Accuracy,
-    AccuracyLimit,
     JudgedJoint,
+    ScatterContribution,
     accuracies,
-    accuracy_limit,
     judged_joints,
+    scatter_contribution,
 )
 from pisigma.validation.report.arm_in_images import ArmInImages
 from pisigma.validation.report.corrections import (
@@ -73,7 +73,7 @@ def verdict_of(
     accuracies: tuple[Accuracy, ...],
     joints: tuple[JudgedJoint, ...],
     rows: JudgedRows | None,
-    limit: AccuracyLimit,
+    limit: ScatterContribution,
     causes: tuple[str, ...] = (),
 ) -> Verdict:
     """Compose the verdict.
@@ -177,7 +177,7 @@ class ReportContent:
     summary: CalibrationSummary | None
     verdict: Verdict
     accuracies: tuple[Accuracy, ...]
-    limit: AccuracyLimit
+    limit: ScatterContribution
     rows: JudgedRows | None
     remarks: tuple[str, ...]
     map: ErrorMap
@@ -263,14 +263,14 @@ def report_content(
         ModelError: files of the folder are missing or were changed.
     """
     summary, held_out = CalibrationSummary.read(model), read_held_out(folder, model)
-    rows = None if held_out is None else rows_of_folder(model, held_out)
+    rows = None if held_out is None else judged_rows_of_folder(model, held_out)
     if measurements is not None:
-        rows = rows_of_file(model, measurements, held_out)
+        rows = judge_rows_of_file(model, measurements, held_out)
     causes = causes_of(summary, diagnostics)
     if rows is not None:
         remarks = (*(one.sentence for one in diagnostics), *remarks, *say("remarks_on_rows", rows))
     figures, joints = accuracies(model, summary, rows), judged_joints(model)
-    limit = accuracy_limit(model, summary, figures[0] if figures else None, rows)
+    limit = scatter_contribution(model, summary, figures[0] if figures else None, rows)
     correlations = parameter_correlations(folder)
     return ReportContent(
         model=model,

@@ -97,7 +97,7 @@ def drawing_style() -> Iterator[None]:
         yield
 
 
-def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
+def check_figures_writable(folder: Path, inputs: Iterable[Input] = ()) -> None:
     """Check in advance that figures can be written into a folder.
 
     Raises:

@@ -12,9 +12,9 @@ from pisigma.reporting.rendering import render_sentences
 from pisigma.reporting.result_text import Table
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.judged_rows import JudgedRows
-from pisigma.validation.report.accuracy import DOMINANT_SHARE, Accuracy, AccuracyLimit, RowOrigin
+from pisigma.validation.report.accuracy import DOMINANT_SHARE, Accuracy, RowOrigin, ScatterContribution
 from pisigma.validation.report.arm_in_images import ArmInImages
-from pisigma.validation.report.corrections import CorrectionCurve, joint_gaps, outside_errors
+from pisigma.validation.report.corrections import CorrectionCurve, outside_errors, partly_measured_joints
 from pisigma.validation.report.dependence import Dependence, ErrorsByFrameOrTarget
 from pisigma.validation.report.error_map import ErrorMap, Layer, Quantity
 
@@ -126,7 +126,7 @@ def advice_for(
     summary: CalibrationSummary | None,
     rows: JudgedRows | None,
     accuracies: tuple[Accuracy, ...],
-    limit: AccuracyLimit,
+    limit: ScatterContribution,
     causes: tuple[str, ...] = (),
 ) -> tuple[str, ...]:
     """Return recommendations for measuring and for the use of a model, the most useful one first.
@@ -142,7 +142,7 @@ def advice_for(
     held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
     of_rows = (
         *say("other_rows", model, held_out),
-        *say("joint_gaps", joint_gaps(model, rows), model),
+        *say("joint_gaps", partly_measured_joints(model, rows), model),
         *say("rows_outside", outside_errors(rows)),
         *(() if rows is None else condition_warnings(model, rows.measurements)),
     )
@@ -178,7 +178,9 @@ def _unsure(summary: CalibrationSummary) -> list[str]:
     ]
 
 
-def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: AccuracyLimit) -> tuple[str, ...]:
+def _more_rows(
+    model: CalibratedModel, summary: CalibrationSummary, limit: ScatterContribution
+) -> tuple[str, ...]:
     points = summary.learning_curve or ()
     if len(points) > 1:
         before, last = ((point.rows, list(point.models.values())[-1].rms_mm or 0.0) for point in points[-2:])

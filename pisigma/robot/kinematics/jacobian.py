@@ -126,8 +126,8 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
 
 
 def smallest_singular_value(
-    robot: Robot, J: Float[Tensor, "*batch 6 dof"], rows: int = 6
+    robot: Robot, J: Float[Tensor, "*batch 6 dof"], nonzero_row_count: int = 6
 ) -> Float[Tensor, "*batch"]:
     """Return the `singularity_measure` for a given joint Jacobian with the given number of nonzero rows."""
     values: Tensor = torch.linalg.svdvals(dimensionless_jacobian(robot, J).contiguous())
-    return values[..., min(rows, robot.dof) - 1]
+    return values[..., min(nonzero_row_count, robot.dof) - 1]

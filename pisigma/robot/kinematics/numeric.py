@@ -232,7 +232,7 @@ def damped_step(
     J: Float[Tensor, "poses 6 dof"],
     scaled_error: Float[Tensor, "poses 6"],
     damping: Float[Tensor, " poses"],
-    rows: int = 6,
+    nonzero_row_count: int = 6,
 ) -> Float[Tensor, "poses dof"]:
     """Compute the damped least-squares step [rad or m] from the smaller of the two forms of the normal equations.
 
@@ -241,17 +241,17 @@ def damped_step(
         J: joint Jacobian.
         scaled_error: pose error with translation in characteristic lengths.
         damping: factor of the squared error in the damping; the product is kept above the rounding level.
-        rows: number of nonzero rows of the Jacobian.
+        nonzero_row_count: number of nonzero rows of the Jacobian.
     """
     A = dimensionless_jacobian(robot, J).contiguous()
-    small = A.mT @ A if robot.dof < rows else A @ A.mT
+    small = A.mT @ A if robot.dof < nonzero_row_count else A @ A.mT
     # Near the solution the damping vanishes, and rounding could make a singular matrix indefinite.
     floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)
     weight = damping * scaled_error.square().sum(-1) + floor
     small = small + weight[:, None, None] * torch.eye(small.shape[-1], dtype=A.dtype, device=A.device)
     error = scaled_error[..., None]
     factor, _ = torch.linalg.cholesky_ex(small)
-    if robot.dof < rows:
+    if robot.dof < nonzero_row_count:
         step = torch.cholesky_solve(A.mT @ error, factor)[..., 0]
     else:
         step = (A.mT @ torch.cholesky_solve(error, factor))[..., 0]
@@ -316,7 +316,7 @@ def approach_preferred(
     T: Float[Tensor, "poses 4 4"],
     q: Float[Tensor, "poses dof"],
     preferred: Float[Tensor, "poses dof"],
-    units: Float[Tensor, " dof"],
+    motion_scale: Float[Tensor, " dof"],
 ) -> Float[Tensor, "poses dof"]:
     """Move the joints of a redundant arm as near to preferred values as pose and limits allow.
 
@@ -330,11 +330,11 @@ def approach_preferred(
         T: target poses.
         q: joint values that reach them [rad or m].
         preferred: preferred joint values [rad or m].
-        units: scale of the motion of every joint [rad or m].
+        motion_scale: scale of the motion of every joint [rad or m].
     """
     length, limits = characteristic_length(robot), torch.from_numpy(robot.limits)
     rows = T.new_tensor([1 / length] * 3 + [1.0] * 3)
-    scale, share = units.expand_as(q).clone(), torch.ones_like(q[:, :1])
+    scale, share = motion_scale.expand_as(q).clone(), torch.ones_like(q[:, :1])
     before, best, active = torch.full_like(share, torch.inf), q.clone(), torch.ones(len(q), dtype=torch.bool)
     for _ in range(tolerances.MAX_STEPS):
         if not active.any():

@@ -106,7 +106,7 @@ def render_image(
     T_camera_board: Float64[np.ndarray, "4 4"],
     exposure: Exposure,
     rng: np.random.Generator,
-    motion: Float64[np.ndarray, " 6"] | None = None,
+    rolling_shutter_motion: Float64[np.ndarray, " 6"] | None = None,
 ) -> UInt8[np.ndarray, "height width"]:
     """Render the gray image that a camera takes of a board, without occlusions.
 
@@ -116,23 +116,28 @@ def render_image(
         T_camera_board: pose of the board [m].
         exposure: light and optics.
         rng: random generator of the noise.
-        motion: motion of the board, shift [m] and rotation vector [rad] in the axes of the camera, between the first
-            and the last row of the image, which a rolling shutter exposes one after the other; None if the board is at
-            rest. The middle row shows the given pose.
+        rolling_shutter_motion: motion of the board, shift [m] and rotation vector [rad] in the axes of the camera,
+            between the first and the last row of the image, which a rolling shutter exposes one after the other; None
+            if the board is at rest. The middle row shows the given pose.
 
     Returns:
         Gray level of every pixel, from 0 to 255.
     """
     gray = np.full((camera.height, camera.width), exposure.background, dtype=np.float32)
-    moved = [_moved(T_camera_board, motion, np.array([share]))[0] for share in (-0.5, 0.5)]
+    moved = [_moved(T_camera_board, rolling_shutter_motion, np.array([share]))[0] for share in (-0.5, 0.5)]
     bounds = np.array(
-        [_bounds(camera, board, T, exposure) for T in (moved if motion is not None else moved[:1])]
+        [
+            _bounds(camera, board, T, exposure)
+            for T in (moved if rolling_shutter_motion is not None else moved[:1])
+        ]
     )
     (left, top), (right, bottom) = bounds[:, :2].min(0).tolist(), bounds[:, 2:].max(0).tolist()
     if left < right and top < bottom:
         rows = np.arange(top, bottom + 1) - 0.5
         rays = _rays(camera, np.arange(left, right + 1) - 0.5, rows)
-        xy, depth = _on_surface(board, _moved(T_camera_board, motion, rows / camera.height - 0.5), rays)
+        xy, depth = _on_surface(
+            board, _moved(T_camera_board, rolling_shutter_motion, rows / camera.height - 0.5), rays
+        )
         sharp = _reflected(_Surface.from_pattern(board.pattern, exposure), xy)
         gray[top:bottom, left:right] = _blurred(sharp, _blur(camera, exposure, depth[1:, 1:]))
     gray *= _light(camera, exposure)

@@ -233,7 +233,7 @@ class SimulatedImages(Section):
         """Render the images pixel by pixel, always the same; the noise of corners is that of their detection."""
         camera, board = self._true()
         q, rng = robot.actual_joints(self._joints(robot)), np.random.default_rng(self.noise.seed)
-        poses = draw_board_poses(
+        poses = noisy_board_poses(
             robot.geometry, q, self.noise.repeatability, self._generator(), self.camera.is_fixed
         )
         for pose in poses.numpy():
@@ -275,7 +275,7 @@ class ImageNoise:
     repeatability: Repeatability = field(default_factory=Repeatability)
 
 
-def draw_board_poses(
+def noisy_board_poses(
     robot: Robot,
     q: Float64[Tensor, "images dof"],
     repeatability: Repeatability,
@@ -322,7 +322,7 @@ def simulate_images(
     """Project the corners of a board into the images of a camera.
 
     Args:
-        robot: the true arm, see `draw_board_poses`.
+        robot: the true arm, see `noisy_board_poses`.
         q: joint values of the images [rad or m].
         camera: the camera.
         board: the board.
@@ -333,7 +333,7 @@ def simulate_images(
     Returns:
         The images, with the corners that are in front of the camera and inside its images.
     """
-    T_camera_board = draw_board_poses(robot, q, noise.repeatability, generator, is_fixed)
+    T_camera_board = noisy_board_poses(robot, q, noise.repeatability, generator, is_fixed)
     pixels, inside = project_corners(camera, board, T_camera_board)
     pixels += noise.corner * torch.randn(pixels.shape, generator=generator, dtype=torch.float64).numpy()
     return images_of(

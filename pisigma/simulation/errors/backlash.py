@@ -8,7 +8,7 @@ from pydantic import Field
 
 from pisigma.files.yaml_file import Seed
 from pisigma.robot.description import Robot
-from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
+from pisigma.simulation.errors.source import AbstractPlaySource, value_per_joint
 
 
 class Backlash(AbstractPlaySource):
@@ -36,5 +36,5 @@ class Backlash(AbstractPlaySource):
 
     def half_play(self, robot: Robot, place_in_recipe: str) -> Float64[np.ndarray, " dof"]:
         """Return half the play of every joint [rad or m]; see `AbstractPlaySource.half_play`."""
-        stated = joint_values(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place_in_recipe)
+        stated = value_per_joint(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place_in_recipe)
         return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3) / 2

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, RobotError, nearest_choice
+from pisigma.files.errors import RecipeError, RobotError, choice_remedy
 from pisigma.robot.coupling_section import CoupledJointSection, coupling_document, rows_and_coupling
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
@@ -49,7 +49,7 @@ class CouplingDeviation(AbstractJointSource):
                 f"joint '{other[0]}' of robot '{robot.name}' is not coupled",
                 option=place_in_recipe,
                 value=other[0],
-                remedy=nearest_choice(other[0], nominal),
+                remedy=choice_remedy(other[0], nominal),
             )
         limited = {axis.name: axis for axis in robot.axes}
         rows = [

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.robot.description import Robot
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, value_per_joint
 
 
 class EncoderQuantisation(AbstractJointSource):
@@ -42,7 +42,7 @@ class EncoderQuantisation(AbstractJointSource):
     def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the quantisation error as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("pulses_per_revolution", "step_mm")
-        stated = joint_values(robot, self.pulses_per_revolution, self.step_mm, fields, place_in_recipe)
+        stated = value_per_joint(robot, self.pulses_per_revolution, self.step_mm, fields, place_in_recipe)
         quantised = torch.from_numpy(stated > 0)
         safe = np.where(stated > 0, stated, 1.0)
         step = torch.from_numpy(np.where(robot.revolute, 2 * np.pi / safe, safe / 1e3))

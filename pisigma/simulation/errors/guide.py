@@ -8,7 +8,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, choice_remedy
 from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, amplitude_of
@@ -67,7 +67,7 @@ class Guide(AbstractJointSource):
                 f"robot '{robot.name}' has no axis '{self.along}'",
                 option=place_in_recipe,
                 value=self.along,
-                remedy=nearest_choice(self.along, names),
+                remedy=choice_remedy(self.along, names),
             )
         index = names.index(self.along)
         travel = float(np.diff(robot.axis_limits[index])[0])

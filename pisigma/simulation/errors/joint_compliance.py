@@ -11,7 +11,12 @@ from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.components import Frame, as_transform, compose_xyz_zyx
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values, row_index
+from pisigma.simulation.errors.source import (
+    AbstractJointSource,
+    JointErrorFunction,
+    row_index,
+    value_per_joint,
+)
 
 Triple = tuple[float, float, float]
 
@@ -61,7 +66,7 @@ class JointCompliance(AbstractJointSource):
     def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the deflection as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("compliance_rad_per_Nm", "compliance_m_per_N")
-        stated = joint_values(
+        stated = value_per_joint(
             robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place_in_recipe
         )
         compliance = torch.from_numpy(stated)

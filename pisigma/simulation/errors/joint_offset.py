@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 
 from pisigma.robot.description import Robot
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, value_per_joint
 
 
 class JointOffset(AbstractJointSource):
@@ -30,7 +30,7 @@ class JointOffset(AbstractJointSource):
 
     def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the offsets as a function of the joint values; see `AbstractJointSource.bind`."""
-        stated = joint_values(
+        stated = value_per_joint(
             robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place_in_recipe
         )
         offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))

@@ -13,7 +13,7 @@ from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdap
 from pydantic_core import CoreSchema, core_schema
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, choice_remedy
 from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 
@@ -132,12 +132,12 @@ def _index(robot: Robot, names: list[str], name: str, what: str, place: str) -> 
             f"robot '{robot.name}' has no {what} '{name}'",
             option=place,
             value=name,
-            remedy=nearest_choice(name, names),
+            remedy=choice_remedy(name, names),
         )
     return names.index(name)
 
 
-def stated_joints(
+def values_by_joint_index(
     robot: Robot,
     revolute_values: Mapping[str, Value],
     prismatic_values: Mapping[str, Value],
@@ -176,15 +176,15 @@ def stated_joints(
     return values
 
 
-def joint_values(
+def value_per_joint(
     robot: Robot,
     revolute_values: Mapping[str, float],
     prismatic_values: Mapping[str, float],
     field_names: tuple[str, str],
     place_in_recipe: str,
 ) -> Float64[np.ndarray, " dof"]:
-    """Return one value per joint [rad or m], 0 if not stated; see `stated_joints`."""
-    stated = stated_joints(robot, revolute_values, prismatic_values, field_names, place_in_recipe)
+    """Return one value per joint [rad or m], 0 if not stated; see `values_by_joint_index`."""
+    stated = values_by_joint_index(robot, revolute_values, prismatic_values, field_names, place_in_recipe)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 
 
@@ -200,7 +200,7 @@ def amplitude_of(
         mm: amplitude of a prismatic joint [mm].
         place_in_recipe: position in the recipe, for messages.
     """
-    stated = joint_values(
+    stated = value_per_joint(
         robot,
         {} if deg is None else {joint: deg},
         {} if mm is None else {joint: mm},

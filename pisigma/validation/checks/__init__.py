@@ -10,7 +10,7 @@
 | Were joint values logged too early, or rounded? | | `lag`, `rounding` | |
 | Do gears have backlash that the rows do not state? | | `backlash` (before the calibration) | |
 | Do measured torques have the sign of the drives? | | `torques` | `model.stated_conditions` |
-| Are all lengths wrong by one factor? | `setup_fault.check_position_size` | `scale` | `scale` |
+| Are all lengths wrong by one factor? | `setup_fault.check_position_spread` | `scale` | `scale` |
 | Do large errors remain that nothing explains? | | `unexplained` | `unexplained` |
 
 What has moved since a calibration, and which rows are wrong under it, are questions about the posterior of a model:

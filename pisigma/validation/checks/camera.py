@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import uncertainty_of
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
@@ -143,7 +143,7 @@ def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -
 
 def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
     """Warn that the images limit the accuracy, with the shares of the predicted error due to intrinsics and boards."""
-    problem, view = result.solved.problem, sensor_view_of(result.solved.refined_linearisation)
+    problem, view = result.solved.problem, contributions_and_noise_of(result.solved.refined_linearisation)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())
     if ratio >= _EXPLAINED:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from pisigma.calibration.geometric.parameter_table import PriorRatio
-from pisigma.calibration.geometric.problem.parameters import zero_directions
+from pisigma.calibration.geometric.problem.parameters import direction_by_zero_parameter
 from pisigma.calibration.geometric.problem.prior_scales import PriorGroup
 from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
 from pisigma.validation.checks.check import CheckedCalibration
@@ -149,7 +149,7 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         return
     usual = checked.robot_class
     far = usual.max_sizes.joint_offset if usual is SERVO else FAR
-    directions = zero_directions(checked.robot)
+    directions = direction_by_zero_parameter(checked.robot)
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
         if joint == one.name or not one.free or abs(one.change) - _CERTAIN * one.standard_error < far:

@@ -13,7 +13,7 @@ from pisigma.validation.checks.prior_ratio import check_joint_zero, check_prior_
 from pisigma.validation.checks.rounding import check_rounding
 from pisigma.validation.checks.row_order import check_row_order
 from pisigma.validation.checks.scale import check_scale, check_scale_of_rows
-from pisigma.validation.checks.search import check_few_rows, check_search
+from pisigma.validation.checks.search import check_convergence, check_few_rows
 from pisigma.validation.checks.setup_fault import check_setup_fault, check_setup_of_rows
 from pisigma.validation.checks.stated_noise import check_stated_noise
 from pisigma.validation.checks.temperature import check_temperature
@@ -36,7 +36,7 @@ _CHECKS: tuple[Check, ...] = (
     check_residual_size,
     check_scale,
     check_prior_ratio,
-    check_search,
+    check_convergence,
     check_stated_noise,
     check_two_populations,
     check_unexplained,

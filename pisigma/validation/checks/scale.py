@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from scipy.special import logsumexp
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import UNDETERMINED, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import UNDETERMINED, contributions_and_noise_of
 from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.robot.frame_fits import best_base_and_tool
@@ -127,7 +127,9 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     """
     problem, here = result.solved.problem, result.solved.refined_linearisation
     precision = (
-        sensor_view_of(here).scaled_precision(problem.precision[problem.active], problem.prior_group).numpy()
+        contributions_and_noise_of(here)
+        .scaled_precision(problem.precision[problem.active], problem.prior_group)
+        .numpy()
     )
     parameters = [problem.space.parameters[index] for index in problem.active.tolist()]
     nominal = problem.prior_mean[problem.active].numpy()

@@ -7,7 +7,7 @@ from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
-def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+def check_convergence(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Reject a search that stopped at the iteration limit, and warn about a search that stalled near the minimum."""
     status = checked.geometric.status
     if not status.is_minimum:

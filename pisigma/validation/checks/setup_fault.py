@@ -18,11 +18,11 @@ from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_swaps
 from pisigma.validation.setup_faults.nominal_robot_faults import (
     MIN_ROWS_NOMINAL,
-    are_unrelated,
+    are_positions_unrelated,
     find_nominal_robot_faults,
-    largest_group,
     largest_zero_sigma,
-    usual_error,
+    prior_rms_position_error,
+    rows_of_most_frequent_frame,
 )
 from pisigma.validation.setup_faults.setup_fault import combine_alternatives, fault_of_cause
 
@@ -60,7 +60,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
             "implausible" if fault.largest_zero_shift > largest_zero_sigma(robot) else "warning"
         )
         return (fault.diagnostic(severity),)
-    if are_unrelated(robot, rows):
+    if are_positions_unrelated(robot, rows):
         return (
             Diagnostic(kind="setup_fault", severity="implausible", sentence=_UNRELATED, cause="unrelated"),
         )
@@ -81,9 +81,9 @@ def check_setup_of_rows(rows: RowsUnderModel) -> Iterator[Diagnostic]:
         yield combine_alternatives(faults).diagnostic()
 
 
-def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+def check_position_spread(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     """Compare the spread of the measured positions with the spread of the nominal robot's positions."""
-    group = largest_group(rows)
+    group = rows_of_most_frequent_frame(rows)
     if group.position is None or group.rows < _MIN_ROWS_OF_SIZE:
         return
     measured, nominal = (
@@ -114,10 +114,10 @@ def check_joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic
 
     With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
     """
-    group = largest_group(rows)
+    group = rows_of_most_frequent_frame(rows)
     if not _MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
         return
-    here, usual = _errors(robot, group, group.q[None], math.inf)[0], usual_error(robot, group.q)
+    here, usual = _errors(robot, group, group.q[None], math.inf)[0], prior_rms_position_error(robot, group.q)
     if not here > usual:
         return
     maps, limit = signs_and_swaps(robot.dof), min(usual, COLLAPSED * here)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.files.errors import IdentificationError
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
@@ -28,7 +28,9 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     solved = checked.geometric.solved
     learned = None if checked.hybrid is None else checked.hybrid.learned
     for sensor, part in zip(
-        solved.problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
+        solved.problem.sensors,
+        contributions_and_noise_of(solved.refined_linearisation).contributions,
+        strict=True,
     ):
         if sensor.sigma is None or sensor.is_stated or sensor.components not in _CHI_MEDIAN:
             continue

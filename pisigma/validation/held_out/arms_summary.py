@@ -87,7 +87,7 @@ class TipFigures(Section):
     standard_errors: Three
 
 
-class ModelFile(Section):
+class ArmModelFolder(Section):
     """Model folder of an arm.
 
     Attributes:
@@ -119,7 +119,7 @@ class ArmsSummary(StoredFigures):
             each.
     """
 
-    arms: tuple[ModelFile, ...]
+    arms: tuple[ArmModelFolder, ...]
     bases: tuple[ArmBaseFigures, ...]
     shared: tuple[SharedFigures, ...]
     misfit: float
@@ -195,7 +195,7 @@ def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diag
     )
 
 
-def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
+def indeterminate_sum_sentences(arm: str, result: CalibrationResult) -> tuple[str, ...]:
     """Return a sentence for every direction of an arm's bases that is known only in a sum with tool parameters."""
     in_a_sum = {one.name for one in result.parameters if one.label.startswith("in a sum")}
     return tuple(
@@ -220,13 +220,13 @@ def arms_summary(
         bases: the arms with their bases.
         robots: names of their robots.
         postures: postures of every arm.
-        indeterminate_sums: sentences of `sums_with_tool` of all arms.
+        indeterminate_sums: sentences of `indeterminate_sum_sentences` of all arms.
     """
     names = [arm.name for arm in bases.arms]
     count = len(names)
     return ArmsSummary(
         arms=tuple(
-            ModelFile(name=arm.name, robot=robot, torso=arm.torso)
+            ArmModelFolder(name=arm.name, robot=robot, torso=arm.torso)
             for arm, robot in zip(bases.arms, robots, strict=True)
         ),
         bases=tuple(base_figures(bases, a, b, postures) for b in range(count) for a in range(b)),

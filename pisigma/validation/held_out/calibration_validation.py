@@ -19,10 +19,10 @@ from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.measurement.splits import TrainTest, with_fewer_training_rows
 from pisigma.validation.held_out.pose_statistics import (
+    ErrorsWithPredictedSigma,
     PoseErrors,
-    PredictedSpread,
     error_statistics,
-    predicted_spread,
+    errors_with_predicted_sigma,
 )
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
@@ -62,7 +62,7 @@ class CalibrationValidation:
 
     folds: int
     errors_by_model: Mapping[str, PoseErrors]
-    spread: PredictedSpread | None = None
+    spread: ErrorsWithPredictedSigma | None = None
     distances: DistanceErrors = field(default_factory=DistanceErrors)
     frames_fitted: int = 0
     sockets_held_out: int = 0
@@ -83,10 +83,10 @@ class CalibrationValidation:
         }
 
     @property
-    def predicted_spread(self) -> PredictedSpread | None:
+    def predicted_spread(self) -> ErrorsWithPredictedSigma | None:
         """Position errors and their predicted standard deviations in all repeats; None without a hybrid."""
         spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
-        return PredictedSpread.concatenate(spreads) if spreads else None
+        return ErrorsWithPredictedSigma.concatenate(spreads) if spreads else None
 
     def figures(self, simulations: Sequence[TrainTest] = ()) -> ValidationFigures:
         """Compute the statistics of all repeats in mm and deg.
@@ -139,7 +139,7 @@ class JudgedFold:
     test_rows: Int64[Tensor, " rows"]
     errors_by_model: Mapping[str, PoseErrors]
     distances: DistanceErrors
-    spread: PredictedSpread | None
+    spread: ErrorsWithPredictedSigma | None
     frames_fitted: int = 0
     sockets_held_out: int = 0
     rows_not_judged: int = 0
@@ -155,7 +155,7 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
         for name, of_fold in fold.errors_by_model.items():
             errors[name].set_rows(fold.test_rows, of_fold)
         if fold.spread is not None:
-            spread = spread or PredictedSpread.all_nan(measurements.rows)
+            spread = spread or ErrorsWithPredictedSigma.all_nan(measurements.rows)
             spread.error[fold.test_rows], spread.sigma[fold.test_rows] = fold.spread.error, fold.spread.sigma
     distances = DistanceErrors.concatenate([fold.distances for fold in judged])
     frames, sockets, not_judged = (
@@ -354,7 +354,7 @@ def _judge(
         }
     errors = {name: pose_errors_of(result, held_out) for name, result in results.items()}
     hybrid = results.get("hybrid")
-    spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
+    spread = errors_with_predicted_sigma(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
     poses = {name: result.predicted_poses(rows) for name, result in results.items() if distances}
     apart = DistanceErrors.from_poses(poses, distances, rows)
     return JudgedFold(torch.arange(held_out.rows), errors, apart, spread)

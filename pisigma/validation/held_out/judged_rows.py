@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
-from pisigma.model.training_rows import known_rows, training_row_warnings
+from pisigma.model.training_rows import training_row_mask, training_row_warnings
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyz_zyx
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
@@ -93,7 +93,7 @@ class JudgedRows:
         return math.sqrt(float((values - mean).square().sum()) / freedom) * 1e3
 
 
-def rows_of_file(
+def judge_rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
     """Evaluate the rows of a file without training rows of the model; only rows marked as test if there are any.
@@ -115,7 +115,7 @@ def rows_of_file(
             residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
         judged = _judged(model, rows, held_out.errors_by_model, residual, ("held_out", origin))
         return replace(judged, left_out=left_out, repeats=_repeats(model))
-    known, again = known_rows(model, rows), tuple[str, ...]()
+    known, again = training_row_mask(model, rows), tuple[str, ...]()
     origin = "training" if digest == model.provenance.data_sha256 or bool(known.all()) else "other"
     if origin == "other":
         again = training_row_warnings(model, rows)
@@ -143,7 +143,7 @@ def rows_of_file(
     )
 
 
-def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
+def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
     """Return the held-out rows that a model folder stores, as `JudgedRows`."""
     rows = Measurements(
         q=held_out.q,

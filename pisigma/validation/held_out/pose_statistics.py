@@ -14,7 +14,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.corner import position_sigmas
+from pisigma.measurement.sensors.corner import relative_position_sigmas
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.robot.se3 import rotation_vector
@@ -197,7 +197,7 @@ def compare_with_nominal(model: CalibratedModel, measurements: Measurements) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedSpread:
+class ErrorsWithPredictedSigma:
     """Position errors and their predicted standard deviations.
 
     Attributes:
@@ -210,15 +210,15 @@ class PredictedSpread:
     sigma: Float64[Tensor, "rows 3"]
 
     @staticmethod
-    def all_nan(rows: int) -> "PredictedSpread":
+    def all_nan(rows: int) -> "ErrorsWithPredictedSigma":
         """Make a spread that is all NaN."""
         nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
-        return PredictedSpread(nothing, nothing.clone())
+        return ErrorsWithPredictedSigma(nothing, nothing.clone())
 
     @staticmethod
-    def concatenate(spreads: Sequence["PredictedSpread"]) -> "PredictedSpread":
+    def concatenate(spreads: Sequence["ErrorsWithPredictedSigma"]) -> "ErrorsWithPredictedSigma":
         """Concatenate spreads."""
-        return PredictedSpread(
+        return ErrorsWithPredictedSigma(
             torch.cat([spread.error for spread in spreads]), torch.cat([spread.sigma for spread in spreads])
         )
 
@@ -246,7 +246,7 @@ class PredictedSpread:
         return torch.isfinite(self.error) & torch.isfinite(self.sigma)
 
 
-def predicted_spread(result: HybridResult, measurements: Measurements) -> PredictedSpread:
+def errors_with_predicted_sigma(result: HybridResult, measurements: Measurements) -> ErrorsWithPredictedSigma:
     """Compute position errors under a hybrid calibration and their predicted standard deviations.
 
     The measurement noise is that estimated from the residuals of the calibration. If the rows of the calibration stated
@@ -255,7 +255,7 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     Raises:
         IdentificationError: a row has a target that was not calibrated.
     """
-    spread = PredictedSpread.all_nan(measurements.rows)
+    spread = ErrorsWithPredictedSigma.all_nan(measurements.rows)
     errors = result.errors_of(measurements).get("position")
     if measurements.position is None or errors is None:
         return spread
@@ -312,7 +312,7 @@ def image_position_rms(measurements: Measurements) -> float:
     noise = measurements.readings.get(NOISE_COLUMN)
     if not isinstance(noise, Tensor):
         return 0.0
-    by_image = position_sigmas(measurements) * noise[:, None]
+    by_image = relative_position_sigmas(measurements) * noise[:, None]
     return float(by_image.square().sum(1).nanmean().sqrt())
 
 
@@ -338,7 +338,9 @@ def _noise(result: CalibrationResult | HybridResult, measurements: Measurements)
         stated = measurements.sigma_position
         if one.sensor == "corner":
             solved = geometric.solved
-            by_image = position_sigmas(solved.setup.weighted_rows(measurements, solved.geometry)).cpu()
+            by_image = relative_position_sigmas(
+                solved.setup.weighted_rows(measurements, solved.geometry)
+            ).cpu()
             deviation = torch.where(by_image.isnan(), deviation, sigma * by_image)
         elif one.sensor == "position" and one.unit != "stated":
             deviation += sigma

@@ -167,7 +167,7 @@ def judged_joints(model: CalibratedModel) -> tuple[JudgedJoint, ...]:
 
 
 @dataclass(frozen=True)
-class AccuracyLimit:
+class ScatterContribution:
     """Contribution of measurement scatter to the error.
 
     Attributes:
@@ -202,17 +202,19 @@ class AccuracyLimit:
         return self.scatter_share is not None and self.scatter_share >= DOMINANT_SHARE
 
 
-def accuracy_limit(
+def scatter_contribution(
     model: CalibratedModel,
     summary: CalibrationSummary | None,
     accuracy: Accuracy | None,
     rows: JudgedRows | None,
-) -> AccuracyLimit:
+) -> ScatterContribution:
     """Compare the error with the scatter of repeated rows, or with the noise that a hybrid calibration identified."""
     if accuracy is not None and accuracy.origin == "poses":
-        return AccuracyLimit(is_approximation=True, limitations=tuple(model.metrics.get("limitations", ())))
+        return ScatterContribution(
+            is_approximation=True, limitations=tuple(model.metrics.get("limitations", ()))
+        )
     scatter = None if rows is None else rows.scatter
-    identified = identified_scatter(summary)
+    identified = identified_noise_sigma_mm(summary)
     noise = scatter if scatter is not None or identified is None else math.sqrt(3) * identified
     source: Literal["repeats", "hybrid"] = "hybrid" if scatter is None else "repeats"
     error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
@@ -222,11 +224,11 @@ def accuracy_limit(
         (one.sigma_mm for one in sensors if one.sigma_mm is not None and one.sensor != "corner"), None
     )
     if noise is None or not error > 0:
-        return AccuracyLimit(rms_error=error, residual_sigma=sigma)
-    return AccuracyLimit(noise, source, error, sigma)
+        return ScatterContribution(rms_error=error, residual_sigma=sigma)
+    return ScatterContribution(noise, source, error, sigma)
 
 
-def identified_scatter(summary: CalibrationSummary | None) -> float | None:
+def identified_noise_sigma_mm(summary: CalibrationSummary | None) -> float | None:
     """Return the standard deviation of a coordinate of measured positions that a hybrid identified [mm].
 
     None for a geometric calibration, whose residuals contain errors that geometry cannot express in addition to noise.

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.parameters import zero_directions
+from pisigma.calibration.geometric.problem.parameters import direction_by_zero_parameter
 from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
@@ -18,7 +18,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import as_poses
 from pisigma.measurement.sensors.intrinsics import CAMERA_COLUMN, boards, texts_of
 from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, poses_of_rows
-from pisigma.model.training_rows import known_rows
+from pisigma.model.training_rows import training_row_mask
 from pisigma.robot.kinematics.components import as_transform
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.se3 import invert, transform, transform_from_xyz_zyx
@@ -155,7 +155,7 @@ def arm_in_images(
             at=Place(rows.source, column="image"),
             remedy="give the images from which `pisigma detect` made the file of corners",
         )
-    training_images = int(known_rows(model, rows)[chosen].sum())
+    training_images = int(training_row_mask(model, rows)[chosen].sum())
     rows = rows.select(torch.tensor(chosen))
     unknowns = {} if model.uncertainty is None else model.uncertainty.geometry.unknowns
     measured = as_poses(rows, unknowns)
@@ -226,7 +226,9 @@ def _zeros(model: CalibratedModel) -> tuple[JointZero, ...]:
         return ()
     figures, robot = {one.name: one for one in summary.parameters}, model.robot
     zeros = []
-    for joint, (name, direction) in zip(robot.joints, zero_directions(robot).items(), strict=True):
+    for joint, (name, direction) in zip(
+        robot.joints, direction_by_zero_parameter(robot).items(), strict=True
+    ):
         one = figures.get(name)
         if joint.type == "revolute" and one is not None and one.change is not None:
             known = None if "prior" in one.label else one.standard_error

@@ -200,7 +200,7 @@ _NOT_MOVED = 1e-3
 
 
 @dataclass(frozen=True)
-class JointGap:
+class PartlyMeasuredJoint:
     """A joint whose range was only partially measured.
 
     Attributes:
@@ -242,7 +242,9 @@ class OutsideErrors:
     rms_inside: float | None
 
 
-def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGap, ...]:
+def partly_measured_joints(
+    model: CalibratedModel, rows: JudgedRows | None
+) -> tuple[PartlyMeasuredJoint, ...]:
     """Return the joints whose range was only partially measured.
 
     Args:
@@ -262,7 +264,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
         factor, unit = (math.degrees(1.0), "deg") if revolute else (1e3, "mm")
         measured = stretches if share >= _NOT_MOVED else [(float(q[0, j]), float(q[0, j]))]
         gaps.append(
-            JointGap(
+            PartlyMeasuredJoint(
                 joint=model.robot.joints[j].name,
                 unit=unit,
                 measured=tuple((a * factor, b * factor) for a, b in measured),

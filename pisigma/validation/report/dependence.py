@@ -89,7 +89,7 @@ class OrderTest:
 
 
 @dataclass(frozen=True)
-class ConditionTest:
+class PayloadOrTemperatureTest:
     """Rank correlation (Spearman) of the length of the error with payload or temperature.
 
     Attributes:
@@ -130,7 +130,7 @@ class Dependence:
     values: Float64[np.ndarray, " rows"]
     errors: dict[str, Float64[np.ndarray, " rows"]]
     error_unit: str
-    test: BinTest | OrderTest | ConditionTest | Untested
+    test: BinTest | OrderTest | PayloadOrTemperatureTest | Untested
 
 
 @dataclass(frozen=True)
@@ -296,9 +296,9 @@ def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
     return (None, 0.0) if max(r) < _ORDERED else (int(np.argmax(r)) + 1, max(r))
 
 
-def _over_condition(values: np.ndarray, errors: np.ndarray) -> ConditionTest:
+def _over_condition(values: np.ndarray, errors: np.ndarray) -> PayloadOrTemperatureTest:
     r, chance = rank_correlation(values, errors)
-    return ConditionTest(float(values.min()), float(values.max()), r, chance)
+    return PayloadOrTemperatureTest(float(values.min()), float(values.max()), r, chance)
 
 
 def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:

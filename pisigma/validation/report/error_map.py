@@ -179,7 +179,7 @@ CELLS = 4
 
 
 @dataclass(frozen=True)
-class Region:
+class WorstRegion:
     """Cell of the measured space with the largest errors, in the robot's base frame.
 
     Attributes:
@@ -215,7 +215,7 @@ class LargestErrors:
     error: float
     unit: str
     position: tuple[float, ...]
-    region: Region | None
+    region: WorstRegion | None
 
 
 def largest_errors(rows: JudgedRows) -> LargestErrors | None:
@@ -234,7 +234,7 @@ def largest_errors(rows: JudgedRows) -> LargestErrors | None:
 
 def worst_region(
     position: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]
-) -> Region | None:
+) -> WorstRegion | None:
     """Find the cell of a grid over the measured space with the largest errors.
 
     Args:
@@ -259,7 +259,7 @@ def worst_region(
     _, chance = kruskal_wallis(inside.astype(int), errors)
     corner = low + width * cell[inside][0]
     rms = root_mean_square(errors[inside])
-    return Region(
+    return WorstRegion(
         low=tuple(corner.tolist()),
         high=tuple((corner + width).tolist()),
         rows=int(inside.sum()),

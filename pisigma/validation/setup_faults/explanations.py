@@ -36,7 +36,7 @@ from pisigma.validation.setup_faults.hypothesis import (
     COLLAPSED,
     Hypothesis,
     PredictingArm,
-    squared_error_with_frames,
+    mean_squared_error,
 )
 from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps
 
@@ -78,7 +78,7 @@ def plausible_orientation_error(robot: Robot) -> float:
     return plausible_error_per_reach(robot) / LEVER_SHARE
 
 
-def explanation_limit(as_stated: Hypothesis, robot: Robot) -> float:
+def max_explained_error(as_stated: Hypothesis, robot: Robot) -> float:
     """Return the largest error [m] that an explanation may leave."""
     return min(COLLAPSED * as_stated.error, plausible_error_per_reach(robot) * robot.reach)
 
@@ -139,7 +139,7 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     tried = list(other_conventions(here.measured.rotation))
     R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
     for mode in arm.fits_of_frames:
-        errors = squared_error_with_frames(mode, here.T, replace(here.measured, rotation=R))
+        errors = mean_squared_error(mode, here.T, replace(here.measured, rotation=R))
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
         for number in errors.argsort()[:_MAX_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:

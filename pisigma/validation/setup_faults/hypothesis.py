@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,
-    affine_error,
+    affine_squared_error,
     base_and_tool_step,
     best_base,
     best_base_and_tool,
@@ -100,7 +100,7 @@ class PredictingArm:
             modes: frames that are fitted.
 
         Returns:
-            The mean squared error of every hypothesis, see `squared_error_with_frames`.
+            The mean squared error of every hypothesis, see `mean_squared_error`.
         """
         chunks = [
             forward_kinematics(self.robot, some)
@@ -109,19 +109,19 @@ class PredictingArm:
             for some in torch.split(q, max(1, _MAX_POSES // rows.rows))
         ]
         return torch.stack(
-            [torch.cat([squared_error_with_frames(mode, T, measured) for T in chunks]) for mode in modes]
+            [torch.cat([mean_squared_error(mode, T, measured) for T in chunks]) for mode in modes]
         )
 
 
-def squared_error_with_frames(
+def mean_squared_error(
     mode: FittedFrames, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
     """Compute the mean squared error [m²] of predicted poses, either unchanged or with frames fitted.
 
-    With base and tool fitted, the result is the lower bound that `affine_error` computes.
+    With base and tool fitted, the result is the lower bound that `affine_squared_error` computes.
     """
     if mode == "base and tool":
-        return affine_error(T, measured)
+        return affine_squared_error(T, measured)
     if mode == "base":
         T = best_base(T, measured)[..., None, :, :] @ T
     error: Tensor = measured.squared_errors(T).mean(-1)

@@ -15,7 +15,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
-from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, affine_squared_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.robot_class import HOBBY, RobotClass
@@ -23,9 +23,9 @@ from pisigma.validation.setup_faults.cause import Cause, join_words
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
     choose_simplest,
-    explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
+    max_explained_error,
 )
 from pisigma.validation.setup_faults.hypothesis import (
     MARGIN,
@@ -85,27 +85,27 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     Returns:
         The faults; empty if the errors are of usual size, or if nothing explains them.
     """
-    rows = largest_group(measurements)
+    rows = rows_of_most_frequent_frame(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return ()
     chosen = evenly_spaced_rows(torch.arange(MARGIN, rows.rows - MARGIN), _MAX_ROWS_NOMINAL)
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
-    here, usual = next(frame_hypotheses(arm, some, [raw])), usual_error(robot, some.q)
+    here, usual = next(frame_hypotheses(arm, some, [raw])), prior_rms_position_error(robot, some.q)
     if len(set(measurements.target)) > 1:
         named = _named_otherwise(robot, measurements, usual)
         if named or not here.error > usual:
             return named
     if not here.error > usual:
         return ()
-    most = explanation_limit(here, robot)
+    most = max_explained_error(here, robot)
     tried = [
         *fault_hypotheses(arm, some, raw, most),
         *_with_joints(arm, some, shifted_rows(robot, rows, chosen, measured), most),
     ]
     faults = choose_simplest(tried, most)
-    if not faults and not are_unrelated(robot, rows):
+    if not faults and not are_positions_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in estimate_joint_values(robot, some, measured))
         faults = choose_simplest(
             _with_joints(arm, some, freed, most, values=1) + _labelled(some, raw.T, measured), most
@@ -152,7 +152,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
     """Return faults in the names of targets in the most frequent frame, if errors are larger than usual [m]."""
-    rows = largest_group(measurements, by_target=False)
+    rows = rows_of_most_frequent_frame(measurements, by_target=False)
     rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
     measured, T = (
@@ -162,7 +162,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()
-    most = explanation_limit(here, robot)
+    most = max_explained_error(here, robot)
     return tuple(
         fault_from_hypothesis(here, other, float("nan"))
         for other in choose_simplest(_labelled(rows, T, measured), most)
@@ -202,20 +202,20 @@ def _with_joints(
     return list(frame_hypotheses(arm, some, hypotheses, most))
 
 
-def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
+def are_positions_unrelated(robot: Robot, measurements: Measurements) -> bool:
     """Return whether positions are unrelated to the joint values of their rows, for example after sorting a column."""
-    rows = largest_group(measurements)
+    rows = rows_of_most_frequent_frame(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return False
     rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), _MAX_ROWS_NOMINAL))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
-    return spread_out > usual_error(robot, rows.q) and fits_by_chance(
+    return spread_out > prior_rms_position_error(robot, rows.q) and fits_by_chance(
         forward_kinematics(robot, rows.q), rows.position
     )
 
 
-def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
+def prior_rms_position_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
     """Compute the RMS position error [m] caused by geometric errors of 1 mm and 1 mrad.
 
     Its covariance is `J P J^T` for the derivative `J` of the position with respect to the DH parameters and their prior
@@ -225,17 +225,17 @@ def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
     return _USUAL * float(J.square().sum((1, 2)).mean().sqrt())
 
 
-def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
+def rows_with_position(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Return the indices of the rows with a position."""
     assert measurements.position is not None
     return torch.isfinite(measurements.position).all(-1).nonzero()[:, 0]
 
 
-def largest_group(measurements: Measurements, by_target: bool = True) -> Measurements:
+def rows_of_most_frequent_frame(measurements: Measurements, by_target: bool = True) -> Measurements:
     """Return the rows with positions of the most frequent frame (and target); empty if none was measured."""
     if measurements.position is None:
         return measurements.select(torch.arange(0))
-    rows = measured_rows(measurements)
+    rows = rows_with_position(measurements)
     names = [
         (measurements.frame[row], measurements.target[row] if by_target else "") for row in rows.tolist()
     ]
@@ -261,7 +261,7 @@ def fits_by_chance(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "ro
 
     none = torch.zeros(len(T), dtype=torch.bool)
     free, left = 36, 3 * (len(T) - 13)
-    unexplained = float(affine_error(T, MeasuredPoses(position, T[:, :3, :3], none, 0.0))) * left / 3
+    unexplained = float(affine_squared_error(T, MeasuredPoses(position, T[:, :3, :3], none, 0.0))) * left / 3
     total = float((position - position.mean(0)).square().sum())
     return float(fdtrc(free, left, (total - unexplained) / free / (unexplained / left))) > _SURE
 

@@ -12,7 +12,12 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
-from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumber, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import (
+    ALWAYS_GOOD,
+    UNDETERMINED,
+    contributions_and_noise_of,
+    renumber,
+)
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
@@ -113,7 +118,7 @@ class OrderedRows:
         solved = geometric.solved
         data, view, rows = (
             solved.measurements,
-            sensor_view_of(solved.refined_linearisation),
+            contributions_and_noise_of(solved.refined_linearisation),
             solved.setup.row_indices.cpu(),
         )
         errors = None if learned is None else result.errors_of(data)
@@ -222,7 +227,7 @@ class OrderedRows:
         """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
-        view = sensor_view_of(self.result.solved.refined_linearisation)
+        view = contributions_and_noise_of(self.result.solved.refined_linearisation)
         if self.prior_factors:
             view = replace(view, prior_scale=view.prior_scale.clamp(min=MIN_USUAL_SCALE))
         precision = view.scaled_precision(active, self.problem.prior_group).cpu().numpy()
@@ -371,11 +376,13 @@ class Effect(NamedTuple):
     log_bayes_factor: float
 
 
-def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:
+def inverse_of(
+    normal_matrix: Float64[np.ndarray, "unknowns unknowns"],
+) -> Float64[np.ndarray, "unknowns unknowns"]:
     """Return the inverse of a normal matrix, with column scaling; undetermined directions get variance 0."""
-    scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scale = 1 / np.sqrt(np.maximum(normal_matrix.diagonal(), 1e-300))
     scales = scale * scale[:, None]
-    scaled = normal * scales
+    scaled = normal_matrix * scales
     with contextlib.suppress(np.linalg.LinAlgError):
         root = np.linalg.cholesky(scaled)
         inverse: np.ndarray = np.linalg.inv(root)

@@ -64,7 +64,7 @@ class Populations:
 
 # cached, because the same rows are checked when they are added to a cell and in its calibration
 @lru_cache(maxsize=2)
-def find_populations(rows: OrderedRows, count: int) -> Populations | None:
+def find_populations(rows: OrderedRows, row_count: int) -> Populations | None:
     """Find the two populations that best explain the residuals of a calibration, whether they are likely or not.
 
     `r_i = X_i x + w_i Z_i m + e_i`: a row of the second population (w_i = 1) has the difference m in addition to the
@@ -74,7 +74,7 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
 
     Args:
         rows: residuals of a calibration.
-        count: number of rows of the measurements.
+        row_count: number of rows of the measurements.
 
     Returns:
         The populations; None if there are too few rows.
@@ -89,7 +89,7 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
         fit = _Mixture(rows, Z, precision).fit_from_starts(some, one)
         if fit.used > _most_used(rows.residual.shape[1]) * fit.values:
             continue
-        second = np.zeros(count, dtype=bool)
+        second = np.zeros(row_count, dtype=bool)
         second[rows.row_index] = _alternating(fit.probability > 0.5)
         if second.sum() > len(rows.row_index) / 2:
             second[rows.row_index] = ~second[rows.row_index]

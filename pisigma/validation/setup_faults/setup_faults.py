@@ -16,9 +16,9 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_fram
 from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
     choose_simplest,
-    explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
+    max_explained_error,
     plausible_orientation_error,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
@@ -27,7 +27,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
     MAX_ROWS,
     evenly_spaced_rows,
     find_nominal_robot_faults,
-    measured_rows,
+    rows_with_position,
 )
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
@@ -65,7 +65,7 @@ def find_setup_faults(
         The faults; empty if the errors are below 0.02 mm, or if nothing explains them.
     """
     judged = without_unknown_orientation(model, measurements)
-    some = judged.select(evenly_spaced_rows(measured_rows(judged), MAX_ROWS))
+    some = judged.select(evenly_spaced_rows(rows_with_position(judged), MAX_ROWS))
     known = with_known_names(model, some, fitted_kinds)
     T = poses_of_rows(model, known)
     predicted = torch.isfinite(T).flatten(1).all(-1)
@@ -80,7 +80,7 @@ def find_setup_faults(
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)
-    most = explanation_limit(here, model.robot)
+    most = max_explained_error(here, model.robot)
     tried = (
         frame_hypotheses(arm, known, [here], most)
         if frames_only

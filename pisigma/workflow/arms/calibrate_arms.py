@@ -40,7 +40,7 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import corrected_joints
 from pisigma.robot.description import Robot
-from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary, sums_with_tool
+from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary, indeterminate_sum_sentences
 from pisigma.validation.held_out.trained_calibrations import geometric_result
 from pisigma.workflow.arms.torso import torso_joints, torso_settings, with_common_joints
 from pisigma.workflow.calibrate import Calibration, calibrate
@@ -248,7 +248,7 @@ def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) 
     sums = tuple(
         sentence
         for name, one in found.items()
-        for sentence in sums_with_tool(name, geometric_result(one.result))
+        for sentence in indeterminate_sum_sentences(name, geometric_result(one.result))
     )
     summary = arms_summary(bases, robots, tuple(map(postures_of, found.values())), sums)
     return ArmsCalibration(found, bases, summary, time.perf_counter() - started)

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior
-from pisigma.files.errors import ModelError, Place, nearest_choice
+from pisigma.files.errors import ModelError, Place, choice_remedy
 from pisigma.files.model_files import model_hash
 from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.lifetime.comparison.moved_bases import MovedBases, MovedBody, RemeasuredArm, find_moved_bases
@@ -137,7 +137,7 @@ def find_moved_arms(
     arms = []
     for name, rows in data.items():
         if name not in poses:
-            raise ModelError(f"there is no arm '{name}'", value=name, remedy=nearest_choice(name, poses))
+            raise ModelError(f"there is no arm '{name}'", value=name, remedy=choice_remedy(name, poses))
         arms.append(_arm(Path(folder), summary, name, poses[name], rows, (cameras or {}).get(name)))
     found = find_moved_bases(arms)
     named = {(one.kind, one.name) for one in found.likely_bodies}

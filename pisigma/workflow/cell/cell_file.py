@@ -273,7 +273,7 @@ class _Places:
 
 
 def settings_from(
-    group: type[Group],
+    settings_class: type[Group],
     stated_values: Mapping[str, Any],
     places: _Places,
     folder: Path,
@@ -282,7 +282,7 @@ def settings_from(
     """Return an instance of a class of settings with the values of a file.
 
     Args:
-        group: class of the settings.
+        settings_class: class of the settings.
         stated_values: values by their keys, in the units of the command line.
         places: places of the keys in the file.
         folder: folder of the cell, to which paths are relative.
@@ -295,14 +295,16 @@ def settings_from(
     def place_of(key: str) -> Place | None:
         return None if key in keys_outside_cell else places.place_of(key)
 
-    values = dict(checked_values(stated_values, settings_by_key(group), place_of))
+    values = dict(checked_values(stated_values, settings_by_key(settings_class), place_of))
     try:
-        built = build_settings(group, dict(_with_paths(group, values, folder, keys_outside_cell)))
+        built = build_settings(
+            settings_class, dict(_with_paths(settings_class, values, folder, keys_outside_cell))
+        )
     except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
         place = place_of(key if key in values or key in keys_outside_cell else "")
         raise (problem if place is None else problem.with_place(place)) from None
-    assert isinstance(built, group)
+    assert isinstance(built, settings_class)
     return built
 
 

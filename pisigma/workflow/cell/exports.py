@@ -18,26 +18,28 @@ NONE = "none"
 """Word that stands for no file if no export is active on the controller."""
 
 
-def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
+def export_from_cell(cell: Cell, format_name: str, request: ExportRequest) -> Exported:
     """Export the model in use of a cell, and record the file in its history.
 
     Args:
         cell: the cell.
-        form: name of the format.
+        format_name: name of the format.
         request: file and options; its model is ignored.
 
     Raises:
         ModelError: no model is in use, or an export that is already active on the controller would be applied as well.
         PisigmaError: see `export_model`.
     """
-    contains = export_format(form).contents_for(request)
+    contains = export_format(format_name).contents_for(request)
     folder, warnings = checked_model_folder(cell.folder, f"export {contains}")
-    exported = export_model(form, replace(request, model=folder))
-    cell.history.add(ExportEntry(request.out.name, _sha256(request.out), form, contains, folder.name, now()))
+    exported = export_model(format_name, replace(request, model=folder))
+    cell.history.add(
+        ExportEntry(request.out.name, _sha256(request.out), format_name, contains, folder.name, now())
+    )
     return replace(exported, warnings=(*warnings, *exported.warnings))
 
 
-def set_controller(
+def record_active_export(
     cell: Cell, file: str | os.PathLike[str], day: str = "", note: str = ""
 ) -> ControllerEntry:
     """Record which exported file is active on the controller; see `record_controller`.

@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
-from pisigma.validation.report.accuracy import identified_scatter
+from pisigma.validation.report.accuracy import identified_noise_sigma_mm
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import RowsWithModelNames, newest_day, setup_name
@@ -226,7 +226,7 @@ def model_entry(
         target_day=newest_day(events, "tool", day),
         p95_mm=result.position_errors_mm[0],
         remark=remark,
-        scatter_mm=identified_scatter(result.summary) if isinstance(result, Calibration) else None,
+        scatter_mm=identified_noise_sigma_mm(result.summary) if isinstance(result, Calibration) else None,
         has_posterior=result.model.uncertainty is not None,
     )
     if parent is None:

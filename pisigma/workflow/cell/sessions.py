@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
 from pisigma.files.model_files import is_unchanged
-from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.controller import ControllerHistory
 from pisigma.lifetime.cell.events import Event
 from pisigma.lifetime.cell.facts import CellFacts, facts_of, foreign_files, sha256_of, unrecorded_files
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
@@ -28,7 +28,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.training_rows import known_rows
+from pisigma.model.training_rows import training_row_mask
 from pisigma.robot.description import Robot
 from pisigma.validation.gate import RowVerdict, check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -166,7 +166,7 @@ class Sessions:
             values = RowValues.from_rows(self.rows_of([one]).as_fields(), self.robot)
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         _check_new(rows, again)
-        model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
+        model, fitted, controller = self.history.in_use, False, ControllerHistory.from_history(self.history)
         at = controller.active_exports(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).checked_warnings(
             self.folder.parent
@@ -179,7 +179,7 @@ class Sessions:
             stated = RecalibrationSettings(seen.changed_frames or None)
             loaded = load_model(self._folder_of(model))
             verdict = check_rows(seen.rows, loaded, stated.fitted_kinds, allowed_moves(stated))
-            training = known_rows(loaded, seen.rows)
+            training = training_row_mask(loaded, seen.rows)
             fitted = bool(training.all())
             if not fitted:
                 _check_new(rows, training)
@@ -311,7 +311,9 @@ class Sessions:
         rows = read_rows(path, self.robot, self.cameras)
         last = max(rows.date or (session.day,))
         changes: list[tuple[str, str]] = [(one.day, one.kind) for one in self.history.events()]
-        changes += [(one.day, "controller") for one in Controller.from_history(self.history).zero_changes]
+        changes += [
+            (one.day, "controller") for one in ControllerHistory.from_history(self.history).zero_changes
+        ]
         if spanned := [kind for day, kind in changes if session.day < day <= last]:
             raise MeasurementError(
                 f"rows of session '{session.name}' were measured before and after an event '{spanned[0]}'",

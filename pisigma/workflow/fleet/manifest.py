@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pisigma.files.errors import FleetError, Phrase, PisigmaError, Place, nearest_choice
+from pisigma.files.errors import FleetError, Phrase, PisigmaError, Place, choice_remedy
 from pisigma.files.setting import build_settings, settings_by_key
 from pisigma.files.setting_values import read_assignments
 from pisigma.lifetime.cell.facts import sha256_of
@@ -116,7 +116,7 @@ def _in_manifest(path: Path, common: NewCell) -> Iterator[_Row]:
     for name in table.header:
         check_separators(name, table.header_place)
         if name not in COLUMNS:
-            at, remedy = Place(path, table.header_line, name), nearest_choice(name, COLUMNS)
+            at, remedy = Place(path, table.header_line, name), choice_remedy(name, COLUMNS)
             raise FleetError("unknown column", value=name, at=at, remedy=remedy)
     required = ("id", "data") if common.robot else COLUMNS[:3]
     if missing := [name for name in required if name not in table.header]:

@@ -189,12 +189,15 @@ def has_image_column(path: str | os.PathLike[str]) -> bool:
 
 
 def join_joint_values(
-    names: Sequence[str], path: str | os.PathLike[str], max_time_difference: float, stop_image_count: int = 0
+    image_names: Sequence[str],
+    path: str | os.PathLike[str],
+    max_time_difference: float,
+    stop_image_count: int = 0,
 ) -> JoinedJoints:
     """Return the joint values at which every image was taken.
 
     Args:
-        names: names of the images without file extensions; they must be time stamps if the log has times.
+        image_names: names of the images without file extensions; they must be time stamps if the log has times.
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
         max_time_difference: largest difference of time stamps [s].
@@ -228,8 +231,10 @@ def join_joint_values(
     if by == "point":
         cells["point"] = tuple(os.path.splitext(os.path.basename(name))[0] for name in cells.pop("image"))
         cells.pop("time", None)
-    images = {"point": tuple(names)} | ({"time": tuple(map(_stamp, names))} if by == "time" else {})
-    measured = ConvertedRows("the images", tuple(range(1, len(names) + 1)), images)
+    images = {"point": tuple(image_names)} | (
+        {"time": tuple(map(_stamp, image_names))} if by == "time" else {}
+    )
+    measured = ConvertedRows("the images", tuple(range(1, len(image_names) + 1)), images)
     joined = join_rows(measured, ConvertedRows(table.source, table.lines, cells), by, max_time_difference)
     rows = joined.rows.cells
     columns = tuple(name for name in rows if find_column(name))

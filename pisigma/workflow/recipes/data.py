@@ -111,12 +111,12 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
     return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
 
 
-def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, Measurements]:
+def simulate_at(recipe: Recipe, joint_file: str | os.PathLike[str]) -> tuple[Robot, Measurements]:
     """Return simulated rows of a recipe's tracker at other joint values; equal calls return equal rows.
 
     Args:
         recipe: a recipe with a simulated tracker.
-        poses: CSV file with columns of joint values, such as a plan.
+        joint_file: CSV file with columns of joint values, such as a plan.
 
     Returns:
         The nominal robot, and the rows.
@@ -131,7 +131,7 @@ def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, M
         raise RecipeError(
             expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit --at"
         )
-    q, noise = read_joints(poses, robot), tracker.noise
+    q, noise = read_joints(joint_file, robot), tracker.noise
     if noise is not None:  # other poses have different noise
         noise = noise.model_copy(update={"seed": noise.seed + zlib.crc32(q.numpy().tobytes())})
     return robot, measure(TrueRobot(robot, data.errors), q, tracker.sensor, noise)

@@ -12,7 +12,7 @@ import torch
 from pydantic import ConfigDict
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.files.errors import IdentificationError, RecipeError, RobotError, nearest_choice
+from pisigma.files.errors import IdentificationError, RecipeError, RobotError, choice_remedy
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.network.inputs import Inputs
 from pisigma.network.sections import GradientDescentSection
@@ -135,7 +135,7 @@ def _check_joints(names: Sequence[str], valid: Sequence[str], taken: Sequence[st
     for index, name in enumerate(names):
         if name not in valid:
             raise RecipeError(
-                f"there is no joint '{name}' to correct", value=name, remedy=nearest_choice(name, valid)
+                f"there is no joint '{name}' to correct", value=name, remedy=choice_remedy(name, valid)
             )
         if name in taken or name in names[:index]:
             raise RecipeError(

@@ -11,7 +11,11 @@ from testing.simulated_arm import BASE, TOOL, dh_errors
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem import problem as calibration_problem
-from pisigma.calibration.geometric.problem.noise import SensorView, angle_disagreement, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import (
+    ContributionsAndNoise,
+    angle_variance_factor,
+    contributions_and_noise_of,
+)
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -59,7 +63,7 @@ def position_errors(seed: int, wobble: float) -> tuple[float, float, Calibration
 
 def factor_of(result: CalibrationResult) -> float:
     """By how much the variance of the orientations was enlarged."""
-    return sensor_view_of(result.solved.solution.linearisation).angle_variance_factor[1]
+    return contributions_and_noise_of(result.solved.solution.linearisation).angle_variance_factor[1]
 
 
 def ratio(wobble: float) -> tuple[float, list[float]]:
@@ -74,7 +78,7 @@ def test_unexplained_orientation_does_not_pull_positions(monkeypatch: pytest.Mon
     assert bounded < 1.03
     assert min(factors) > 3
     monkeypatch.setattr(
-        calibration_problem, "angle_disagreement", lambda _, view, *__: torch.ones_like(view.noise)
+        calibration_problem, "angle_variance_factor", lambda _, view, *__: torch.ones_like(view.noise)
     )
     unbounded, _ = ratio(wobble=5e-4)
     assert unbounded > 1.2  # rows taken as independent
@@ -90,10 +94,10 @@ def test_the_factor_makes_lengths_move_by_as_much_as_expected() -> None:
     """Against the definition, with inverses written out."""
     result = position_errors(0, 5e-4)[2]
     problem, here = result.solved.problem, result.solved.solution.linearisation
-    view = sensor_view_of(here)
+    view = contributions_and_noise_of(here)
     held = view.scaled_precision(problem.precision[problem.active], problem.prior_group)
     off = (here.point - problem.prior_mean)[problem.active]
-    factor = angle_disagreement(problem.sensors, view, held, -held * off)[1]
+    factor = angle_variance_factor(problem.sensors, view, held, -held * off)[1]
     usual = torch.diag(problem.step_scale)
     (Q, R), (lengths, angles) = (
         [getattr(part, name) / view.noise[k] ** 2 for k, part in enumerate(view.contributions)]
@@ -115,5 +119,5 @@ def test_angles_alone_and_lengths_alone_keep_their_variance() -> None:
     T = forward_kinematics(robot, q)
     for rows in (Measurements(q, T[:, :3, 3]), Measurements(q, rotation=T[:, :3, :3])):
         solved = GeometricCalibrator(robot).solve(rows)
-        view: SensorView = sensor_view_of(solved.solution.linearisation)
+        view: ContributionsAndNoise = contributions_and_noise_of(solved.solution.linearisation)
         assert view.angle_variance_factor.tolist() == [1.0]

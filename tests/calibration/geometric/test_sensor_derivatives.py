@@ -19,7 +19,7 @@ from testing.sensors import (
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -133,7 +133,7 @@ def test_pairs_in_any_order_and_many_rows_stay_together() -> None:
     tool = setup.problem.space.split(setup.start)[2][0].numpy()
     started = arm.nominal.with_geometry(tool=tool)
     for chosen in (problem, part):
-        part = sensor_view_of(chosen.linearise(setup.start, None)).contributions[0]
+        part = contributions_and_noise_of(chosen.linearise(setup.start, None)).contributions[0]
         p = forward_kinematics(started, chosen.q)[:, :3, 3]
         expected = chosen.sensors[0].measured[::2] - (p[::2] - p[1::2]).norm(dim=-1)  # type: ignore[attr-defined]
         assert_close(part.residual[0, ::2], expected, atol=1e-12)

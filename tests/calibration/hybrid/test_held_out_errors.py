@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.design import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance
 from pisigma.estimation.held_out import HeldOutErrors
-from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.regression import SensorValueCount
 
 FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovariance}
 
@@ -104,7 +104,7 @@ def test_parameters_determined_only_by_held_out_values_are_treated_as_fitted() -
     inverse = torch.linalg.inv(S)
     M = inverse - inverse @ Z @ torch.linalg.inv(Z.t() @ inverse @ Z) @ Z.t() @ inverse
     sensor = torch.zeros(8, dtype=torch.int64)
-    counts = [SensorCount(8.0, False, False)]
+    counts = [SensorValueCount(8.0, False, False)]
     found = HeldOutErrors.from_fit(M, M @ y, sensor, counts)
     expected = (y - Z @ torch.linalg.lstsq(Z, y).solution) * (8 / 6) ** 0.5
     assert_close(found.error, expected, atol=1e-9)
@@ -117,7 +117,7 @@ def test_downweighted_values_have_larger_errors_than_their_weight() -> None:
     """Counted as a third, a value has three times the variance of noise that its weight says."""
     _, S, y = residuals(6, 1)
     sensor = torch.tensor([0, 0, 0, 1, 1, 1])
-    counts = [SensorCount(3.0, False, False), SensorCount(1.0, False, False, 3.0)]
+    counts = [SensorValueCount(3.0, False, False), SensorValueCount(1.0, False, False, 3.0)]
     M = torch.linalg.inv(S)
     alone = HeldOutErrors.from_fit(
         M, M @ y, sensor, [counts[0], replace(counts[1], repeat_variance_factor=1.0)]

@@ -9,7 +9,7 @@ from testing.linearised import random_joints, tracker_data
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.design import Rows
+from pisigma.calibration.hybrid.design import LinearisedRows
 from pisigma.calibration.hybrid.refinement import RefinedFit, linearise_rows, refine
 from pisigma.calibration.hybrid.search import FeatureChoice, FeatureFit
 from pisigma.measurement.conditions import JointState
@@ -65,7 +65,7 @@ def test_the_network_predicts_what_the_design_does(refined: RefinedFit) -> None:
     assert bool(orders) == any(chosen.name == "products" for chosen in design.features)
 
 
-def chosen_as(refined: RefinedFit, rows: Rows) -> FeatureChoice:
+def chosen_as(refined: RefinedFit, rows: LinearisedRows) -> FeatureChoice:
     """A choice that came to a solution on some rows."""
     fitted = FeatureFit(refined.design, refined.posterior)
     return FeatureChoice(rows, fitted, fitted, ())

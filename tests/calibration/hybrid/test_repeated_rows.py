@@ -8,7 +8,7 @@ from testing.linearised import random_joints, tracker_data
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.design import Design, LinearisedRows
 from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -30,7 +30,7 @@ def values_of(rows: int) -> SensorValues:
 
 def sums_of(design: Design, values: SensorValues) -> NormalEquations:
     group = torch.zeros(design.problem.q.shape[0], dtype=torch.int64)
-    return NormalEquations.from_rows(design, Rows(design.problem, (values,), group))
+    return NormalEquations.from_rows(design, LinearisedRows(design.problem, (values,), group))
 
 
 def test_excluded_rows_are_left_out_and_the_others_weighted() -> None:
@@ -139,7 +139,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     problem = problem.with_active(range(2))
     design = Design(problem, ())
     three = alike(3).downweight_correlated(torch.arange(8).repeat_interleave(3))
-    rows = [Rows(problem, (values,), torch.arange(24)) for values in (three, values_of(8))]
+    rows = [LinearisedRows(problem, (values,), torch.arange(24)) for values in (three, values_of(8))]
     many, single = (NormalEquations.from_rows(design, one) for one in rows)
     assert_close(many.normal, single.normal, rtol=1e-12)
     assert_close(many.descent, single.descent, rtol=1e-12, atol=1e-12)

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, random_joints, tracker_data
 from testing.linearised import linearised as linearised_at_solution
 
-from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
+from pisigma.calibration.hybrid.design import Design, LinearisedRows, robust_weights
 from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
@@ -76,7 +76,9 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
     values = sensor_values(problem, point, correction_from_weights(design, x))
     weights = [torch.ones_like(sensor.weight_root) for sensor in values]
     bare = replace(problem, pose=None)
-    found = Rows.from_linearisation(replace(design, problem=bare), x, values, weights, arm.rows.group)
+    found = LinearisedRows.from_linearisation(
+        replace(design, problem=bare), x, values, weights, arm.rows.group
+    )
     for there, sensor in zip(values, found.values, strict=True):
         left = sensor.residual - design.columns(sensor, slice(None)) @ x
         assert_close(left, there.residual, atol=1e-15)

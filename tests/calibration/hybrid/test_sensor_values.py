@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem, MotionMemory
 from pisigma.calibration.hybrid.design import Design
 from pisigma.calibration.hybrid.refinement import correction_from_weights
-from pisigma.calibration.hybrid.sensor_values import joint_columns, sensor_values
+from pisigma.calibration.hybrid.sensor_values import joint_value_parameters, sensor_values
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
@@ -204,9 +204,9 @@ def problem_rows(problem: CalibrationProblem, data: Measurements) -> Tensor:
 def test_joint_columns_are_theta_of_turning_and_d_of_sliding_joints() -> None:
     robot = Robot.load("kiro3")
     problem = GeometricCalibrator(robot).build(tracker("kiro3", (1, 1, 1, 1))[1]).problem
-    names = [problem.space.names[k] for k in joint_columns(problem.space).tolist()]
+    names = [problem.space.names[k] for k in joint_value_parameters(problem.space).tolist()]
     wanted = ["d" if joint.type == "prismatic" else "theta" for joint in robot.joints]
     assert [name.partition("_")[0] for name in names] == wanted
-    assert [problem.space.parameters[k].owner for k in joint_columns(problem.space).tolist()] == [
+    assert [problem.space.parameters[k].owner for k in joint_value_parameters(problem.space).tolist()] == [
         joint.name for joint in robot.joints
     ]

@@ -17,9 +17,9 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import FeatureFit
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
-from pisigma.estimation.held_out import MAX_SCALE, HeldOutErrors, held_out_scale
+from pisigma.estimation.held_out import MAX_SCALE, HeldOutErrors, held_out_covariance_factor
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import MIN_EFFECTIVE, prior_size_columns
+from pisigma.estimation.regression import MIN_EFFECTIVE, prior_scale_columns
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -60,7 +60,7 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
         if told > MIN_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
-    added = prior_size_columns(posterior, fit.covariance_root(posterior))
+    added = prior_scale_columns(posterior, fit.covariance_root(posterior))
     assert_close(added @ added.t(), expected, atol=1e-7 * float(expected.abs().max()))
 
 
@@ -68,7 +68,7 @@ def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
     fit, prior = small_problem()
     flat = replace(prior, unit_precision=torch.where(prior.group == 2, prior.unit_precision, 0.0))
     posterior = fit.solve(flat, (0.4,))
-    added = prior_size_columns(posterior, fit.covariance_root(posterior))
+    added = prior_scale_columns(posterior, fit.covariance_root(posterior))
     assert_close(added, torch.zeros_like(added))
 
 
@@ -80,15 +80,15 @@ def missed(error: Tensor, spread: Tensor) -> HeldOutErrors:
 def test_widening_makes_held_out_errors_as_large_as_predicted() -> None:
     spread = 1 + normal(500, seed=0).abs()
     error = 3 * spread * normal(500, seed=1)
-    factor = held_out_scale(missed(error, spread))
+    factor = held_out_covariance_factor(missed(error, spread))
     assert factor > 2
     assert_close((error.square() / (1 + factor * (spread.square() - 1))).mean(), 1.0, atol=1e-9)
 
 
 def test_errors_as_predicted_do_not_widen_intervals_and_widening_is_limited() -> None:
     spread = 1 + normal(500, seed=0).abs()
-    assert held_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
-    hopeless = held_out_scale(missed(100 + spread, torch.ones_like(spread)))
+    assert held_out_covariance_factor(missed(0.9 * normal(500, seed=1), spread)) == 1.0
+    hopeless = held_out_covariance_factor(missed(100 + spread, torch.ones_like(spread)))
     assert_close(hopeless, MAX_SCALE, rtol=1e-9)
 
 
@@ -166,7 +166,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
     root = NormalEquations.from_rows(fitted.design, arm.rows).covariance_root(fitted.posterior)
-    root = torch.cat([root.as_matrix, prior_size_columns(fitted.posterior, root)], 1)
+    root = torch.cat([root.as_matrix, prior_scale_columns(fitted.posterior, root)], 1)
     C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))

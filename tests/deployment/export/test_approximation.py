@@ -9,7 +9,7 @@ from testing.models import joints_around
 from pisigma.deployment.export.approximation import (
     ApproximationProblem,
     all_parameter_indices,
-    joint_offsets,
+    joint_offset_indices,
     solve_approximation,
 )
 from pisigma.robot import Robot
@@ -21,7 +21,7 @@ def test_the_fit_is_a_minimum():
     nominal, random = Robot.load("ur10"), np.random.default_rng(0)
     true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
     q = joints_around("ur10", 200, spread=0.8)
-    problem = ApproximationProblem(nominal, q, forward_kinematics(true, q), joint_offsets(nominal))
+    problem = ApproximationProblem(nominal, q, forward_kinematics(true, q), joint_offset_indices(nominal))
     fitted, seen = solve_approximation(problem)
     assert seen == (False, True, True, True, True, False)
     missing, J = problem.residual(fitted)
@@ -31,7 +31,7 @@ def test_the_fit_is_a_minimum():
     assert missing.norm() < problem.residual(nominal)[0].norm() / 1.5
 
 
-@pytest.mark.parametrize("free", [joint_offsets, all_parameter_indices])
+@pytest.mark.parametrize("free", [joint_offset_indices, all_parameter_indices])
 def test_the_derivative_agrees_with_finite_differences(free):
     robot, q = Robot.load("kiro3"), joints_around("kiro3", 4)
     problem = ApproximationProblem(robot, q, forward_kinematics(robot, q), free(robot))

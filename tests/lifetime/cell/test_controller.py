@@ -8,7 +8,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, ModelError
-from pisigma.lifetime.cell.controller import RULES, Controller, Situation, record_controller
+from pisigma.lifetime.cell.controller import RULES, ControllerHistory, Situation, record_controller
 from pisigma.lifetime.cell.exports import Contents, ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.history import HISTORY, History, InUse, ModelEntry, SessionEntry
@@ -38,7 +38,7 @@ SITUATIONS: dict[Situation, tuple[ModelEntry, tuple[str, ...]]] = {
 
 
 def controller(*hashes, day="2026-01-20"):
-    return Controller(tuple(change(day, one) for one in hashes), (DH, OFFSETS, PROGRAM))
+    return ControllerHistory(tuple(change(day, one) for one in hashes), (DH, OFFSETS, PROGRAM))
 
 
 def test_the_table_has_every_situation_and_every_content():
@@ -78,7 +78,7 @@ def test_every_rule_of_the_table(command, situation, tmp_path):
 
 @pytest.mark.parametrize("command", RULES)
 def test_nothing_is_refused_while_nothing_is_active(command):
-    for changes in (Controller(), controller("dh", "offsets", "")):
+    for changes in (ControllerHistory(), controller("dh", "offsets", "")):
         found = changes.findings(command, MODEL, (BEFORE, AFTER))
         assert (found.refusal, found.warnings) == ("", ())
 
@@ -91,7 +91,7 @@ def test_kinematics_and_joint_zeros_are_active_together():
 
 
 def test_zeros_that_were_removed_are_missing_for_a_model_that_was_measured_with_them():
-    changes = Controller((change("2026-01-20", "offsets"), change("2026-03-01", "")), (OFFSETS,))
+    changes = ControllerHistory((change("2026-01-20", "offsets"), change("2026-03-01", "")), (OFFSETS,))
     assert changes.findings("serve", NEWER, (BEFORE, AFTER)).refusal
     assert not changes.findings("serve", MODEL, (BEFORE, AFTER)).refusal
     assert [changes.matches_session(one) for one in (BEFORE, AFTER)] == [True, False]
@@ -146,7 +146,7 @@ def test_what_cannot_be_active_is_refused(tmp_path, sha256, day, option):
         record_controller(history, sha256, day, "")
     assert history.controller() == ()
     record_controller(history, "dh", "2026-01-20", "at low speed")
-    assert Controller.from_history(history).active_exports()["kinematics"].since == "2026-01-20"
+    assert ControllerHistory.from_history(history).active_exports()["kinematics"].since == "2026-01-20"
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_days_are_those_of_the_time_zone_of_the_machine(tmp_path, monkeypatch, z
         assert history.record("accepted", day, "", "A. Auditor").day == day
         record_controller(history, "offsets", day, "")
         since = ControllerEntry(day, "offsets", "", f"{utc[:14]}00:00.000+00:00")
-        assert Controller((since,), history.exports()).fits(made, ())
+        assert ControllerHistory((since,), history.exports()).fits(made, ())
     finally:
         monkeypatch.undo()
         time.tzset()

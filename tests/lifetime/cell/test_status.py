@@ -5,7 +5,7 @@ from typing import get_args
 
 import pytest
 
-from pisigma.lifetime.cell.controller import Controller, valid_sessions
+from pisigma.lifetime.cell.controller import ControllerHistory, valid_sessions
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts
@@ -44,7 +44,7 @@ THIRD = session("2026-03-10", rows=10)
 MONITORED = replace(VERIFIED, sessions=(FIRST, SECOND, THIRD), today="2026-03-11")
 NEWER = model("b", "2026-01-10,2026-02-10", day="2026-02-10", p95_mm=0.1)
 
-OFFSETS = Controller(
+OFFSETS = ControllerHistory(
     (ControllerEntry("2026-02-20", "hash", "", "2026-02-20T08:00:00+00:00"),),
     (ExportEntry("offsets.csv", "hash", "offsets", "joint_zeros", "a", "2026-02-19T08:00:00+00:00"),),
 )
@@ -175,13 +175,13 @@ def test_a_step_that_failed_is_not_named_again():
 @pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *sorted(ARM_EVENTS)])
 def test_only_events_of_the_arm_end_the_validity_of_sessions(kind):
     event = Event("2026-02-01", kind, "", "2026-02-01T08:00:00+00:00")
-    valid = valid_sessions((FIRST, SECOND), (event,), Controller())
+    valid = valid_sessions((FIRST, SECOND), (event,), ControllerHistory())
     assert valid == ((SECOND,) if kind in ARM_EVENTS else (FIRST, SECOND))
 
 
 def test_a_session_of_the_day_of_an_event_was_measured_after_it():
     event = Event("2026-02-10", "mastering", "", "2026-02-10T08:00:00+00:00")
-    assert valid_sessions((FIRST, SECOND), (event,), Controller()) == (SECOND,)
+    assert valid_sessions((FIRST, SECOND), (event,), ControllerHistory()) == (SECOND,)
     assert next_step(replace(VERIFIED, events=(event,), in_use=None)).state == "not_calibrated"
     # a model in use is recalibrated, which takes fewer poses than a calibration
     assert (
@@ -193,7 +193,7 @@ def test_a_session_of_the_day_of_an_event_was_measured_after_it():
 def test_a_session_that_was_set_aside_counts_no_more():
     aside = replace(SECOND, set_aside="wrong tool")
     assert next_step(replace(MEASURED_AGAIN, sessions=(FIRST, aside))).state == "not_verified"
-    assert valid_sessions((FIRST, aside), (), Controller()) == (FIRST,)
+    assert valid_sessions((FIRST, aside), (), ControllerHistory()) == (FIRST,)
 
 
 def test_a_new_session_after_a_calibration_that_failed_is_calibrated_with():
@@ -282,7 +282,7 @@ def test_a_model_that_fits_the_joint_zeros_is_used_or_else_calibrated():
     refused = check("recalibrate", "a", "2026-03-10", "not_trusted", at="2026-03-11T08:00:00+00:00")
     step = next_step(replace(facts, checks=(*facts.checks, refused)))
     assert (step.state, step.verb) == ("other_joint_zeros", "calibrate")
-    without = Controller(
+    without = ControllerHistory(
         (*OFFSETS.changes, replace(OFFSETS.changes[0], day="2026-03-20", sha256="")), OFFSETS.exports
     )
     step = next_step(replace(facts, models=(fitting,), in_use=fitting, controller=without))

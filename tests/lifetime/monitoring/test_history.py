@@ -15,13 +15,13 @@ from pisigma.files.errors import OutputError
 from pisigma.lifetime.cell.history import History
 from pisigma.lifetime.cell.layout import CELL_FILE, history_of_model
 from pisigma.lifetime.monitoring.history import Record, store_sessions
-from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.lifetime.monitoring.session import JointZeros, SessionResult
 from pisigma.lifetime.recalibration.movement import Movement
 
 
 def record(number, date="2026-01-01"):
     moved = (Movement("joint 3", 0.05, 0.002, "deg", 0.999),)
-    session = Session(
+    session = SessionResult(
         10, 1e-9, moved, (("joint 3", 0.9),), 1e-4 * number, 5e-5, 1.0, 1.1, 30, ("base",), (True, False)
     )
     zeros = JointZeros(

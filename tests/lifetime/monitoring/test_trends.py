@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.lifetime.monitoring.history import Record
-from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.lifetime.monitoring.session import JointZeros, SessionResult
 from pisigma.lifetime.monitoring.trends import charts_of, forecast_of, jumps_of, trends_of
 from pisigma.robot.row import Row
 
@@ -23,7 +23,7 @@ def records(months, per_month=0.0, per_kelvin=0.0, rms=lambda month: 1e-4, warm=
         temperature = warm(month)
         shift = DEVIATION * noise[month]
         shift[0] += math.radians(per_month) * month + math.radians(per_kelvin) * (temperature or 0.0)
-        session = Session(10, 0.9, (), (), rms(month), rms(month), 1.0, 1.0, 30, (), (True, month != 1))
+        session = SessionResult(10, 0.9, (), (), rms(month), rms(month), 1.0, 1.0, 30, (), (True, month != 1))
         zeros = JointZeros(
             shift,
             torch.full((2,), DEVIATION).double(),

@@ -34,7 +34,7 @@ def test_the_prior_is_the_posterior_of_the_model():
     parameters = len(posterior.space.parameters)
     back = torch.cat(
         [
-            problem.coordinate_change @ problem.covariance_root[:parameters],
+            problem.coordinate_jacobian @ problem.covariance_root[:parameters],
             problem.covariance_root[parameters:],
         ]
     )

@@ -8,7 +8,7 @@ from testing.lerobot_arm import DATA_SETS, MOTORS, RANGES, SO101
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.lerobot_dataset import joint_motors, read_joint_log
+from pisigma.measurement.foreign.lerobot_dataset import position_indices_of_motors, read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text
 from pisigma.workflow.images.detect import join_joint_values
 
@@ -52,12 +52,12 @@ def test_normalized_values_need_the_calibration_file(tmp_path):
     ],
 )
 def test_only_positions_of_joints_are_taken(names, prefix, expected):
-    assert joint_motors(names, prefix) == expected
+    assert position_indices_of_motors(names, prefix) == expected
 
 
 def test_values_of_two_arms_need_a_prefix():
     with refused(MeasurementError, option="prefix"):
-        joint_motors(("left_a.pos", "right_a.pos"))
+        position_indices_of_motors(("left_a.pos", "right_a.pos"))
 
 
 def test_values_that_are_not_possible_in_their_units_are_refused():

@@ -16,7 +16,7 @@ from pisigma.measurement.camera.camera import USUAL_DEVIATIONS
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.corner import position_sigmas
+from pisigma.measurement.sensors.corner import relative_position_sigmas
 from pisigma.measurement.sensors.intrinsics import without_stated_priors
 
 
@@ -56,11 +56,11 @@ def test_deviations_of_positions_are_those_of_their_covariance() -> None:
     weight = torch.zeros(8, 6, 6, dtype=torch.float64)
     weight[:, row, column] = torch.tensor([[float(word) for word in text.split()] for text in texts]).double()
     covariance = torch.linalg.inv(weight.mT @ weight)[:, :3, :3].diagonal(dim1=1, dim2=2)
-    deviation = position_sigmas(data) * torch.as_tensor(noise)[:, None]
+    deviation = relative_position_sigmas(data) * torch.as_tensor(noise)[:, None]
     assert_close(deviation, covariance.sqrt(), rtol=1e-4)
     assert float(deviation.min()) > 2e-5  # the repeatability
     tracker = Measurements(q=data.q, position=data.position)
-    assert bool(position_sigmas(tracker).isnan().all())
+    assert bool(relative_position_sigmas(tracker).isnan().all())
 
 
 def test_positions_of_images_without_their_rotations_are_plain_positions() -> None:

@@ -20,8 +20,12 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_position_sigma
 from pisigma.validation.held_out.validation_figures import ErrorFigures
-from pisigma.validation.report.accuracy import accuracy_limit
-from pisigma.validation.report.corrections import correction_curves, joint_gaps, measured_intervals
+from pisigma.validation.report.accuracy import scatter_contribution
+from pisigma.validation.report.corrections import (
+    correction_curves,
+    measured_intervals,
+    partly_measured_joints,
+)
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -215,10 +219,10 @@ def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
     model = hybrid[1]
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
-    limit = accuracy_limit(model, CalibrationSummary.read(model), accuracy, None)
+    limit = scatter_contribution(model, CalibrationSummary.read(model), accuracy, None)
     assert_close(limit.scatter, math.sqrt(3) * sigma, rtol=1e-12)
     larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.scatter)})
-    limit = accuracy_limit(model, CalibrationSummary.read(model), larger, None)
+    limit = scatter_contribution(model, CalibrationSummary.read(model), larger, None)
     assert_close(limit.scatter_share, 0.25, rtol=1e-12)
     assert (limit.source, limit.is_mostly_scatter) == ("hybrid", False)
 
@@ -227,7 +231,7 @@ def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
     model = hybrid[1]
     accuracy = report_content(model, tmp_path).accuracies[0]
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
-    limit = accuracy_limit(model, CalibrationSummary.read(model), smaller, None)
+    limit = scatter_contribution(model, CalibrationSummary.read(model), smaller, None)
     assert limit.scatter > 1e-3
     assert limit.scatter_share is None
     assert limit.rms_error == 1e-3
@@ -265,7 +269,7 @@ def test_measured_values_are_in_the_stretches_up_to_turns(hybrid):
 @pytest.mark.parametrize("name", ["kiro3", "ur10"])
 def test_gaps_of_joints_that_were_measured_in_part(name, tmp_path):
     model = hand_made_model(name)
-    gap = joint_gaps(model, None)[0]
+    gap = partly_measured_joints(model, None)[0]
     own = np.degrees(model.starts[:, 0].numpy())
     assert gap.joint == "theta_1"
     assert gap.measured_share < 1

@@ -17,7 +17,7 @@ from testing.report import HOSTILE, folder_with_held_out, geometric_under_test, 
 
 from pisigma.files.errors import OutputError
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.drawing import check_figures, write_figures
+from pisigma.reporting.page.drawing import check_figures_writable, write_figures
 from pisigma.reporting.page.figures import draw_dependence, draw_figures
 from pisigma.reporting.page.page import render_page, script_json
 
@@ -176,9 +176,9 @@ def test_figures_are_written_as_png_svg_and_csv(tmp_path):
     assert {path.suffix for path in written} == {".png", ".svg", ".csv"}
     (tmp_path / "file").write_text("")
     with refused(OutputError, option="--figures", file="file"):
-        check_figures(tmp_path / "file")
+        check_figures_writable(tmp_path / "file")
     with refused(OutputError, option="--figures", file=str(tmp_path / "none" / "figures")):
-        check_figures(tmp_path / "none" / "figures")
+        check_figures_writable(tmp_path / "none" / "figures")
 
 
 @pytest.mark.parametrize("name", ["$x$", r"\frac{$", "theta_1", "\u6f22$"])

@@ -297,7 +297,7 @@ def test_a_file_is_restored_without_torch(name, arms, tmp_path):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert_close(np.array(eval(done.stdout)), kernels.solve(T).q, atol=1e-12)
-    save_compiled(model, file, belongs_to="5ca1ab1e")
+    save_compiled(model, file, model_folder_hash="5ca1ab1e")
     loaded = CompiledIK.load(file)
     assert (loaded.belongs_to, kernels.belongs_to) == ("5ca1ab1e", "")
     assert (loaded.branches, loaded.joints, loaded.name) == (kernels.branches, kernels.joints, kernels.name)

@@ -12,7 +12,7 @@ from testing.outside_arm import ARMS, OutsideArm
 from testing.report import bare_summary
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.parameters import zero_directions
+from pisigma.calibration.geometric.problem.parameters import direction_by_zero_parameter
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.robot_class import HOBBY, INDUSTRIAL, SERVO
@@ -56,7 +56,7 @@ def test_healthy_arms_are_plausible(name, rows):
 
 def test_errors_of_zeros_count_in_the_direction_of_the_joint(monkeypatch):
     robot = Robot.load("fanuc_r2000")
-    assert zero_directions(robot) == {f"theta_{k}": 1 if k < 3 else -1 for k in range(1, 7)}
+    assert direction_by_zero_parameter(robot) == {f"theta_{k}": 1 if k < 3 else -1 for k in range(1, 7)}
     theta = SimpleNamespace(name="theta_3", free=True, change=np.deg2rad(2.0), standard_error=1e-4)
     found = SimpleNamespace(
         robot=robot, rows=None, robot_class=INDUSTRIAL, geometric=SimpleNamespace(parameters=[theta])

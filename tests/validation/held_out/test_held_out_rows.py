@@ -20,8 +20,8 @@ from pisigma.measurement.faults import RowPlace
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation
 from pisigma.validation.held_out.held_out_rows import HeldOutRows, read_held_out
-from pisigma.validation.held_out.judged_rows import rows_of_folder
-from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread
+from pisigma.validation.held_out.judged_rows import judged_rows_of_folder
+from pisigma.validation.held_out.pose_statistics import ErrorsWithPredictedSigma, PoseErrors
 from pisigma.validation.report.dependence import dependences
 from pisigma.validation.report.error_map import largest_errors, map_of_rows
 
@@ -36,7 +36,7 @@ def _validation(rows: int, turned: bool, spread: bool) -> CalibrationValidation:
         position[-1] = torch.nan
         models[name] = PoseErrors(position, torch.from_numpy(rng.uniform(0, 1e-3, rows)) if turned else None)
     error = torch.from_numpy(rng.normal(0, 1e-4, (rows, 3)))
-    found = PredictedSpread(error, error.abs()) if spread else None
+    found = ErrorsWithPredictedSigma(error, error.abs()) if spread else None
     return CalibrationValidation(5, models, found)
 
 
@@ -91,7 +91,7 @@ def test_rows_of_a_report_are_named_by_file_and_line(measured, tmp_path):
         replace(measured, line=line, origin=origin),
     )
     (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
-    rows = rows_of_folder(model, read_held_out(tmp_path, model))
+    rows = judged_rows_of_folder(model, read_held_out(tmp_path, model))
     shown = map_of_rows(model, rows)
     assert shown.row.tolist() == list(line)
     assert shown.numbering == ("first.csv, line", "second.csv, line") * (ROWS // 2)
@@ -104,7 +104,7 @@ def test_joint_values_of_a_report_are_those_of_the_controller(tmp_path):
     q = model.starts[:ROWS]
     text, model = _kept(model, _validation(ROWS, False, False), Measurements(q=q))
     (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
-    rows = rows_of_folder(model, read_held_out(tmp_path, model))
+    rows = judged_rows_of_folder(model, read_held_out(tmp_path, model))
     assert_close(rows.measurements.q, q, rtol=1e-9)
     shown = np.rad2deg(model.robot.to_controller(q.numpy()))
     assert_close(map_of_rows(model, rows).q, shown, atol=1e-7)

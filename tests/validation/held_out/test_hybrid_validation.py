@@ -15,7 +15,11 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.splits import holdout, k_folds
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import judge, learning_curve, validate
-from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread, predicted_spread
+from pisigma.validation.held_out.pose_statistics import (
+    ErrorsWithPredictedSigma,
+    PoseErrors,
+    errors_with_predicted_sigma,
+)
 from pisigma.validation.held_out.trained_calibrations import with_missing_frames
 
 ROWS = 240
@@ -94,20 +98,20 @@ def test_coverage_of_errors_drawn_as_predicted(generator):
     sigma = torch.rand(4000, 3, generator=generator, dtype=torch.float64) + 0.1
     error = sigma * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
     error[::7], sigma[1::7] = torch.nan, torch.nan
-    spread = PredictedSpread(error, sigma)
+    spread = ErrorsWithPredictedSigma(error, sigma)
     assert spread.value_count < 12000
     assert_close(spread.coverage, 0.95, atol=0.01)
-    assert_close(PredictedSpread(0.5 * error, sigma).coverage, 1.0, atol=1e-3)
-    assert PredictedSpread.all_nan(5).in_file_units() == {}
+    assert_close(ErrorsWithPredictedSigma(0.5 * error, sigma).coverage, 1.0, atol=1e-3)
+    assert ErrorsWithPredictedSigma.all_nan(5).in_file_units() == {}
 
 
 def test_stated_noise_applies_per_row_and_rows_without_it_are_exact(arm):
     stated = torch.full((ROWS,), NOISE, dtype=torch.float64)
     rows = replace(arm.measurements, sigma_position=stated)
     result = small(arm.true.nominal).fit(rows)
-    known = predicted_spread(result, rows)
-    exact = predicted_spread(result, replace(rows, sigma_position=None))
-    loud = predicted_spread(result, replace(rows, sigma_position=10 * stated))
+    known = errors_with_predicted_sigma(result, rows)
+    exact = errors_with_predicted_sigma(result, replace(rows, sigma_position=None))
+    loud = errors_with_predicted_sigma(result, replace(rows, sigma_position=10 * stated))
     deviation = result.sigma(rows)
     assert_close(exact.sigma, deviation, atol=1e-15)
     added = (known.sigma.square() - deviation.square()).sqrt()

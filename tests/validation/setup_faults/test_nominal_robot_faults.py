@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 from testing.simulated_arm import simulate
 
-from pisigma.robot.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.robot.frame_fits import MeasuredPoses, affine_squared_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.setup_faults.explanations import other_conventions
 from pisigma.validation.setup_faults.nominal_robot_faults import (
-    are_unrelated,
+    are_positions_unrelated,
     find_nominal_robot_faults,
-    usual_error,
+    prior_rms_position_error,
 )
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -43,17 +43,17 @@ def arm():
 def test_faults_are_named(arm, name, kind):
     (fault,) = find_nominal_robot_faults(arm.nominal, MISTAKES[name].change(arm.measurements, arm.nominal))
     assert fault.kinds == (kind,)
-    assert fault.rms_after < 3 * usual_error(arm.nominal, arm.measurements.q) < fault.rms_before
+    assert fault.rms_after < 3 * prior_rms_position_error(arm.nominal, arm.measurements.q) < fault.rms_before
     assert fault.explains_orientation == (kind not in ("position_unit",))
 
 
 def test_healthy_and_unrelated_rows_have_no_fault(arm):
     rows = arm.measurements
     assert find_nominal_robot_faults(arm.nominal, rows) == ()
-    assert not are_unrelated(arm.nominal, rows)
+    assert not are_positions_unrelated(arm.nominal, rows)
     mixed = MISTAKES["rows in another order"].change(rows, arm.nominal)
     assert find_nominal_robot_faults(arm.nominal, mixed) == ()
-    assert are_unrelated(arm.nominal, mixed)
+    assert are_positions_unrelated(arm.nominal, mixed)
 
 
 def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
@@ -61,9 +61,9 @@ def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
     T = forward_kinematics(arm.nominal, arm.measurements.q)
     base, tool = best_base_and_tool(T, measured)
     rigid = measured.squared_errors(base @ T @ tool).mean()
-    assert (1 - 13 / len(T)) * affine_error(T, measured) < rigid
+    assert (1 - 13 / len(T)) * affine_squared_error(T, measured) < rigid
     batch = torch.stack([T, T.flip(0)])
-    assert_close(affine_error(batch, measured)[0], affine_error(T, measured), atol=1e-12)
+    assert_close(affine_squared_error(batch, measured)[0], affine_squared_error(T, measured), atol=1e-12)
     assert_close(best_base_and_tool(batch, measured)[0][0], base, atol=1e-6)
 
 

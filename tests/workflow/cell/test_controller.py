@@ -16,7 +16,7 @@ from pisigma.deployment.serve.models import ServedModels
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell import controller
 from pisigma.lifetime.cell.controller import RULES, checked_model_folder, model_in_use_warnings
-from pisigma.workflow.cell.exports import export_from_cell, set_controller
+from pisigma.workflow.cell.exports import export_from_cell, record_active_export
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 
@@ -59,7 +59,7 @@ def test_every_command_of_the_table_is_called():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_checks_the_table_first(command, cell, used, tmp_path, monkeypatch):
-    set_controller(cell, used.folder.parent / "dh.csv", day(0))
+    record_active_export(cell, used.folder.parent / "dh.csv", day(0))
     monkeypatch.setattr(
         controller, "RULES", dict.fromkeys(RULES, ("allow",) * 3) | {command: ("refuse",) * 3}
     )
@@ -72,7 +72,7 @@ def test_every_command_checks_the_table_first(command, cell, used, tmp_path, mon
 
 
 def test_kinematics_leave_the_sessions_valid_and_are_named_by_the_status(cell, used):
-    set_controller(cell, used.folder.parent / "dh.csv", day(0), "at low speed")
+    record_active_export(cell, used.folder.parent / "dh.csv", day(0), "at low speed")
     status = cell.status()
     assert status.step.state == used.status().step.state
     (active,) = status.to_json()["controller"]
@@ -85,14 +85,14 @@ def test_kinematics_leave_the_sessions_valid_and_are_named_by_the_status(cell, u
         day(0),
     ]
     assert any("dh.csv" in one for one in pisigma.load(cell.folder).warnings)
-    set_controller(cell, "none")
+    record_active_export(cell, "none")
     assert cell.status().to_json()["controller"] == []
 
 
 def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     old = cell.history.in_use
     followed, served = pisigma.load(cell.folder), ServedModels(cell=cell.folder)
-    set_controller(cell, used.folder.parent / "offsets.csv", day(10))
+    record_active_export(cell, used.folder.parent / "offsets.csv", day(10))
     followed._in_use.check()
     (sentence,) = served.reload()
     assert "offsets.csv" in sentence
@@ -127,7 +127,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     followed._in_use.check()
     assert served.find_model(None).name == followed.name == entry.name
 
-    set_controller(cell, "none", day(1))
+    record_active_export(cell, "none", day(1))
     with refused(ModelError, file=cell.folder):
         pisigma.load(cell.folder)
     assert cell.status().step.command.split()[1:] == ["use", str(cell.folder), old.name]
@@ -137,7 +137,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
 
 
 def test_a_calibration_with_joint_zeros_states_that_it_needs_them(cell, used):
-    set_controller(cell, used.folder.parent / "offsets.csv", day(10))
+    record_active_export(cell, used.folder.parent / "offsets.csv", day(10))
     cell.add_session(measured(30, 4, zero=ZERO), day=day(5))
     result, entry = cell.calibrate(model="geometric", folds=0)
     assert "offsets.csv" in result.warnings[0]
@@ -146,7 +146,7 @@ def test_a_calibration_with_joint_zeros_states_that_it_needs_them(cell, used):
 
 def test_rows_before_and_after_a_change_of_the_joint_zeros_are_not_one_session(cell, used, tmp_path):
     rows = measured(10, 5)
-    set_controller(cell, used.folder.parent / "offsets.csv", day(3))
+    record_active_export(cell, used.folder.parent / "offsets.csv", day(3))
     dates = tuple(day(4) if row < 5 else day(2) for row in range(10))
     cell.add_session(pisigma.Measurements(q=rows.q, position=rows.position, date=dates))
     with refused(MeasurementError, value="controller"):
@@ -158,5 +158,5 @@ def test_a_file_that_was_edited_is_not_known(cell, used, tmp_path):
     (tmp_path / "dh.csv").write_text(text + "\n")
     for file in (tmp_path / "dh.csv", tmp_path / "missing.csv"):
         with refused(MeasurementError, option="--export"):
-            set_controller(cell, file)
+            record_active_export(cell, file)
     assert ROBOT.name == cell.robot.name

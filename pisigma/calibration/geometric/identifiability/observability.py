@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 _ROUNDING = 1e-12
@@ -74,7 +74,7 @@ def find_weak_directions(
         problem: the problem with its free parameters.
         linearisation: linearisation of the problem at the solution.
     """
-    view, stated = sensor_view_of(linearisation), problem.precision[problem.active]
+    view, stated = contributions_and_noise_of(linearisation), problem.precision[problem.active]
     precision = view.scaled_precision(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = linearisation.normal - torch.diag(precision)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.identifiability.sufficiency import CalibrationWarning
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.files.errors import ImplausibleError, Place
 from pisigma.robot.robot_class import plausible_error_per_reach
@@ -130,7 +130,9 @@ def residual_sizes(
 ) -> Float64[Tensor, " rows"]:
     """Compute the length of every row's residual per component [m]; NaN if no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
-    for sensor, part in zip(problem.sensors, sensor_view_of(linearisation).contributions, strict=True):
+    for sensor, part in zip(
+        problem.sensors, contributions_and_noise_of(linearisation).contributions, strict=True
+    ):
         if sensor.unit == "m" and not sensor.is_stated:
             size = part.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)

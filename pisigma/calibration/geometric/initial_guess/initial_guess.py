@@ -20,7 +20,7 @@ from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     tools_from_distances,
 )
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.files.errors import IdentificationError, Place, nearest_choice
+from pisigma.files.errors import IdentificationError, Place, choice_remedy
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.sensor import distinct_names, indices_of_names
@@ -286,5 +286,5 @@ def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], so
                 option="base_guesses",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, frames),
+                remedy=choice_remedy(name, frames),
             )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import SensorView
+from pisigma.calibration.geometric.problem.noise import ContributionsAndNoise
 from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
@@ -93,7 +93,7 @@ def information(
     problem: CalibrationProblem,
     point: Float64[Tensor, " parameters"],
     candidates: list[int],
-    view: SensorView | None = None,
+    view: ContributionsAndNoise | None = None,
 ) -> Information:
     """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
 
@@ -135,7 +135,7 @@ def information(
 
 
 def _row_weights(
-    problem: CalibrationProblem, view: SensorView, number: int, rows: slice
+    problem: CalibrationProblem, view: ContributionsAndNoise, number: int, rows: slice
 ) -> Float64[Tensor, " poses"]:
     """Compute 1 / standard deviation of every row for a sensor [1/m or 1/rad]; 0 in rows without a value."""
     sensor = problem.sensors[number]

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation, covariance_of
-from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.problem.noise import contributions_and_noise_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import CornerSensor, with_pose_noise
@@ -87,7 +87,7 @@ def joint_scatter_factor(
         `sqrt(b / a)`; 1 if the rows are too few to distinguish both.
     """
     number = next(k for k, sensor in enumerate(problem.sensors) if isinstance(sensor, CornerSensor))
-    sensor, view = problem.sensors[number], sensor_view_of(linearisation)
+    sensor, view = problem.sensors[number], contributions_and_noise_of(linearisation)
     assert isinstance(sensor, CornerSensor)
     part, scale = view.contributions[number], view.noise[number]
     rows = sensor.present.nonzero()[:, 0]

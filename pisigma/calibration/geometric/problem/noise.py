@@ -68,7 +68,7 @@ def joined_contributions(chunks: Sequence[SensorContribution]) -> SensorContribu
 
 
 @dataclass(frozen=True, eq=False)
-class SensorView:
+class ContributionsAndNoise:
     """Contributions of all sensors at a point, with their estimated noise.
 
     Attributes:
@@ -78,7 +78,7 @@ class SensorView:
         repeat_variance_factor: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in
             it share the errors of the model and are not independent; see `group_variance_ratio`.
         angle_variance_factor: factor >= 1 on the variance per sensor that makes angles agree with the measured lengths;
-            see `angle_disagreement`.
+            see `angle_variance_factor`.
         prior_scale: scale of the prior standard deviations, per group of parameters.
     """
 
@@ -89,11 +89,11 @@ class SensorView:
     prior_scale: Float64[Tensor, " groups"]
 
     @staticmethod
-    def without_noise(contributions: tuple[SensorContribution, ...]) -> "SensorView":
+    def without_noise(contributions: tuple[SensorContribution, ...]) -> "ContributionsAndNoise":
         """Return the contributions with standard deviations of 1 and the stated prior."""
         ones = contributions[0].normal.new_ones(max(len(contributions), len(PriorGroup)))
         sensors = ones[: len(contributions)]
-        return SensorView(contributions, sensors, sensors, sensors, ones[: len(PriorGroup)])
+        return ContributionsAndNoise(contributions, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
     def scales(self) -> Float64[Tensor, " sensors"]:
@@ -112,14 +112,14 @@ class SensorView:
         return scaled_precision(precision, group, self.prior_scale)
 
 
-def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
+def contributions_and_noise_of(linearisation: Linearisation[Tensor]) -> ContributionsAndNoise:
     """Return the contributions of the sensors in a linearisation of a `CalibrationProblem`."""
-    assert isinstance(linearisation.problem_data, SensorView)
+    assert isinstance(linearisation.problem_data, ContributionsAndNoise)
     return linearisation.problem_data
 
 
 def effective_parameters_by_sensor(
-    view: SensorView, covariance: Float64[Tensor, "active active"]
+    view: ContributionsAndNoise, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
     """Compute the effective number of parameters that are estimated from every sensor's values (Förstner 1979)."""
     used = [(part.normal * covariance).sum() for part in view.contributions]
@@ -129,7 +129,7 @@ def effective_parameters_by_sensor(
 def noise_scales(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
-    view: SensorView,
+    view: ContributionsAndNoise,
     effective_parameters: Float64[Tensor, " sensors"],
     refine: bool,
 ) -> Float64[Tensor, " sensors"]:
@@ -158,7 +158,9 @@ def noise_scales(
     return torch.stack(scales)
 
 
-def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
+def rejects_rows(
+    sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: ContributionsAndNoise
+) -> bool:
     """Return whether any loss gives a row a weight of 0."""
     of_each = zip(sensors, losses, view.contributions, view.scales, strict=True)
     return any(
@@ -176,7 +178,7 @@ def renumber(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
 def group_variance_ratio(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
-    view: SensorView,
+    view: ContributionsAndNoise,
     effective_parameters: Float64[Tensor, " sensors"],
     pose: Int64[Tensor, " rows"] | None,
     configuration: Int64[Tensor, " rows"] | None = None,
@@ -216,9 +218,9 @@ def group_variance_ratio(
     return torch.stack(ratios)
 
 
-def angle_disagreement(
+def angle_variance_factor(
     sensors: Sequence[AbstractSensor],
-    view: SensorView,
+    view: ContributionsAndNoise,
     prior_precision: Float64[Tensor, " active"],
     prior_gradient: Float64[Tensor, " active"],
 ) -> Float64[Tensor, " sensors"]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, prior_group_of
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, choice_remedy
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup, Unknowns
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.parameter_jacobian import parameter_order
@@ -199,7 +199,7 @@ class ParameterSpace:
             raise IdentificationError(
                 f"robot '{self.robot.name}' has no parameter '{name}'",
                 value=name,
-                remedy=nearest_choice(name, self.names),
+                remedy=choice_remedy(name, self.names),
             )
         return self._numbers[name]
 
@@ -296,7 +296,7 @@ def row_labels(robot: Robot) -> tuple[str, ...]:
     return tuple(labels)
 
 
-def zero_directions(robot: Robot) -> dict[str, int]:
+def direction_by_zero_parameter(robot: Robot) -> dict[str, int]:
     """Return the direction of every joint by the name of the parameter that is its zero, such as "theta_2".
 
     The zero of a joint with the direction -1 moves against the joint if the parameter increases.

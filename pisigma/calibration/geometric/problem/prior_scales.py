@@ -148,6 +148,6 @@ def converged_prior_scales(
     return scale
 
 
-def has_converged(previous: Tensor, current: Tensor, share: float) -> bool:
+def has_converged(previous: Tensor, current: Tensor, relative_tolerance: float) -> bool:
     """Return whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
-    return bool(((current / previous - 1).abs() < share).all())
+    return bool(((current / previous - 1).abs() < relative_tolerance).all())

@@ -15,16 +15,16 @@ from pisigma.calibration.geometric.problem.least_squares import (
     covariance_of,
 )
 from pisigma.calibration.geometric.problem.noise import (
+    ContributionsAndNoise,
     SensorContribution,
-    SensorView,
-    angle_disagreement,
+    angle_variance_factor,
+    contributions_and_noise_of,
     effective_parameters_by_sensor,
     group_variance_ratio,
     joined_contributions,
     noise_scales,
     rejects_rows,
     renumber,
-    sensor_view_of,
 )
 from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorScaling
 from pisigma.calibration.geometric.problem.prior_scales import (
@@ -151,18 +151,22 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
         """Return the RMS residual length of the first sensor [m or rad]."""
-        return sensor_view_of(linearisation).contributions[0].rms
+        return contributions_and_noise_of(linearisation).contributions[0].rms
 
     def linearise(self, point: Tensor, with_noise_of: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum the normal equations, with rows weighted by the noise of `with_noise_of`, or equally if None."""
-        before = None if with_noise_of is None else sensor_view_of(with_noise_of)
+        before = None if with_noise_of is None else contributions_and_noise_of(with_noise_of)
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
             chunks.append([self._sums(k, before, motion, unknowns, rows) for k in range(len(self.sensors))])
         parts = tuple(joined_contributions(of_sensor) for of_sensor in zip(*chunks, strict=True))
-        view = SensorView.without_noise(parts) if before is None else replace(before, contributions=parts)
+        view = (
+            ContributionsAndNoise.without_noise(parts)
+            if before is None
+            else replace(before, contributions=parts)
+        )
         return self.combine_contributions(point, view)
 
     def linearise_at_start(self, point: Tensor) -> Linearisation[Tensor]:
@@ -172,7 +176,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """
         weighted = self.with_updated_noise(self.linearise(point, None))[0]
         losses = [self.loss_for_sensor(sensor) for sensor in self.sensors]
-        if not rejects_rows(self.sensors, losses, sensor_view_of(weighted)):
+        if not rejects_rows(self.sensors, losses, contributions_and_noise_of(weighted)):
             return weighted
         return self.with_updated_noise(self.linearise(point, weighted))[0]
 
@@ -187,7 +191,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _renewed(
         self, linearisation: Linearisation[Tensor], refine: bool
     ) -> tuple[Linearisation[Tensor], bool]:
-        view = sensor_view_of(linearisation)
+        view = contributions_and_noise_of(linearisation)
         covariance = covariance_of(linearisation.normal)
         used = effective_parameters_by_sensor(view, covariance)
         noise = noise_scales(self.sensors, self.loss, view, used, refine)
@@ -201,7 +205,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
             held = view.scaled_precision(self._prior, self.prior_group)
             renewed = replace(
-                renewed, angle_variance_factor=angle_disagreement(self.sensors, renewed, held, -held * off)
+                renewed, angle_variance_factor=angle_variance_factor(self.sensors, renewed, held, -held * off)
             )
         if self._sized:
             renewed = replace(renewed, prior_scale=self._prior_scales(renewed, off, covariance, refine))
@@ -214,7 +218,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         )
 
     def _prior_scales(
-        self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
+        self, view: ContributionsAndNoise, off: Tensor, covariance: Tensor, refine: bool
     ) -> Float64[Tensor, " groups"]:
         """Estimate the prior scales; during a search, jointly with the step that results from them.
 
@@ -289,7 +293,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 J = J.index_add(0, positions, block.derivative[column] * theirs)
         return J
 
-    def combine_contributions(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+    def combine_contributions(self, point: Tensor, view: ContributionsAndNoise) -> Linearisation[Tensor]:
         """Return the linearisation from the sensors' contributions, divided by their variances, and the prior."""
         off = self._off(point)
         precision = view.scaled_precision(self._prior, self.prior_group)
@@ -309,7 +313,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return Linearisation(point, cost, descent, normal, misfit, rounding, view)
 
     def _data_equations(
-        self, view: SensorView
+        self, view: ContributionsAndNoise
     ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
         """Return the total of the sensors' contributions, divided by their variances, without the prior."""
         terms = [
@@ -348,7 +352,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         )
 
     def _sums(
-        self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
+        self,
+        number: int,
+        view: ContributionsAndNoise | None,
+        motion: ToolMotion,
+        unknowns: Unknowns,
+        rows: slice,
     ) -> SensorContribution:
         """Compute the contribution of a sensor in rows, weighted by its noise, or equally if `view` is None."""
         sensor, everywhere = self.sensors[number], self.measured_in_every_row[number]

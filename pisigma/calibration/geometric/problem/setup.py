@@ -150,7 +150,7 @@ def build_setup(
 def setup_from_guess(
     space: ParameterSpace,
     initial_guess: InitialGuess,
-    usable: tuple[Tensor, Measurements],
+    indices_and_usable_rows: tuple[Tensor, Measurements],
     options: SetupOptions,
     prior: Prior | None,
     loss: AbstractLoss,
@@ -161,13 +161,13 @@ def setup_from_guess(
     Args:
         space: the parameters.
         initial_guess: bases, tools and sensors' unknowns.
-        usable: result of `usable_rows`.
+        indices_and_usable_rows: result of `usable_rows`.
         options: settings of base, tool and sensors.
         prior: prior of the geometric errors.
         loss: loss function.
         dh: start values of the rows of the arm [rad and m]; None for the nominal ones.
     """
-    rows, measurements = usable
+    rows, measurements = indices_and_usable_rows
     device = measurements.q.device
     frame = indices_of_names(measurements.frame, space.frames, measurements.rows).to(device)
     target = indices_of_names(measurements.target, space.targets, measurements.rows).to(device)
@@ -304,7 +304,7 @@ class IdentifiedGeometry:
         """Derivative of the user's coordinates with respect to the problem's; requires `setup` and `point`."""
         assert self.setup is not None
         assert self.point is not None
-        return coordinate_change(self.setup, self.point.cpu())
+        return coordinate_jacobian(self.setup, self.point.cpu())
 
     def values_of(self, space: ParameterSpace) -> Float64[Tensor, " parameters"]:
         """Return all parameters of a space as a vector; NaN for missing unknowns of sensors."""
@@ -346,7 +346,7 @@ def in_user_coordinates(
     return dh.numpy(), bases.numpy(), tools.numpy()
 
 
-def coordinate_change(
+def coordinate_jacobian(
     setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
 ) -> Float64[Tensor, "parameters parameters"]:
     """Return the derivative of all parameters in the user's coordinates with respect to the problem's parameters.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.deployment.export.approximation import (
-    Departure,
+    ToolDeviation,
     all_parameter_indices,
     approximate_model,
     departure_from_nominal,
@@ -54,7 +54,7 @@ class FileContent:
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class ControllerFrames:
     """Frames of a controller relative to the frames of a robot description.
 
     Attributes:
@@ -85,7 +85,7 @@ class Convention:
     """
 
     nominal: Robot
-    frames: Frames | None = None
+    frames: ControllerFrames | None = None
     published_values: str | None = None
 
     @property
@@ -195,7 +195,7 @@ def untested_sentence(source: str) -> str:
 
 
 def frame_sentences(robot: Robot) -> tuple[str, ...]:
-    """Return base and tool as comments for files that cannot contain them; `with_frames` reads them back."""
+    """Return base and tool as comments for files without them; `with_frames_from_comments` reads them back."""
     sentences = []
     for part in ("base", "tool"):
         values = in_file_units(FRAME_COLUMNS, getattr(robot, part)).items()
@@ -203,7 +203,7 @@ def frame_sentences(robot: Robot) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def with_frames(robot: Robot, text: str) -> Robot:
+def with_frames_from_comments(robot: Robot, text: str) -> Robot:
     """Return the robot with base and tool from the comments of a text, if there are any."""
     frames: dict[str, np.ndarray] = {}
     for part in ("base", "tool"):
@@ -258,12 +258,12 @@ class ControllerReading:
     """
 
     robot: Robot
-    deviation_from_nominal: Departure
-    frames: Frames | None
+    deviation_from_nominal: ToolDeviation
+    frames: ControllerFrames | None
     remarks: tuple[str, ...]
 
 
-def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHANGE) -> ControllerReading:
+def read_controller_file(path: Path, nominal: Robot, max_change_mm: float = MAX_CHANGE) -> ControllerReading:
     """Read a controller's file as a robot.
 
     Supported files are Universal Robots' calibration.conf, the kinematics YAML of their ROS driver, Staubli's arm.cfx,
@@ -274,12 +274,12 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
         path: file to read.
         nominal: robot of the controller without the file, which provides names and limits, and base and tool if the
             file has none.
-        max_change: largest accepted mean distance [mm] between the two tools in the same frame, and between points at
-            `_LEVER` from them due to their rotations.
+        max_change_mm: largest accepted mean distance [mm] between the two tools in the same frame, and between points
+            at `_LEVER` from them due to their rotations.
 
     Raises:
         RobotError: the file cannot be read, is of another kind, does not match the robot, or changes it by more than
-            `max_change`.
+            `max_change_mm`.
     """
     suffix, kinds = path.suffix.lower(), _kinds()
     suffixes = dict.fromkeys([*(one for kind in kinds for one in kind.suffixes), *TABLE_SUFFIXES])
@@ -297,13 +297,15 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
     convention = file.convention(nominal) if file else Convention(nominal)
     # The base and tool of the file define the frames of its poses and are not treated as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
-    change = departure_from_nominal(robot, with_frames(convention.nominal, text) if file else there)
-    if not max(change.mean_mm, _LEVER * change.mean_mrad) <= max_change:
+    change = departure_from_nominal(
+        robot, with_frames_from_comments(convention.nominal, text) if file else there
+    )
+    if not max(change.mean_mm, _LEVER * change.mean_mrad) <= max_change_mm:
         raise RobotError(
-            f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / _LEVER:g} mrad "
-            f"on average, got {change.mean_mm:.4g} mm and {change.mean_mrad:.4g} mrad relative to robot "
-            f"'{nominal.name}'",
-            expected=f"a mean change of at most {max_change:g} mm",
+            f"expected a calibration that moves the tool by at most {max_change_mm:g} mm and "
+            f"{max_change_mm / _LEVER:g} mrad on average, got {change.mean_mm:.4g} mm and "
+            f"{change.mean_mrad:.4g} mrad relative to robot '{nominal.name}'",
+            expected=f"a mean change of at most {max_change_mm:g} mm",
             value=change.mean_mm,
             at=Place(path),
             remedy="check that --like is the robot of this file and that its units are radians and metres, or state "

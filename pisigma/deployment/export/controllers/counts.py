@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from pisigma.deployment.export.approximation import joint_offsets
+from pisigma.deployment.export.approximation import joint_offset_indices
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileContent,
@@ -13,7 +13,7 @@ from pisigma.deployment.export.controllers.controller_file import (
 )
 from pisigma.deployment.export.dh_table import csv_table, parameter_columns
 from pisigma.deployment.export.export_format import ExportRequest
-from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between, read_offsets
+from pisigma.deployment.export.joint_offsets import joint_derivatives_by_axis, offsets_between, read_offsets
 from pisigma.files.errors import OutputError
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
@@ -91,8 +91,8 @@ def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarra
 
 
 def check_robot(robot: Robot) -> None:
-    """Raise an error for robots whose axes have no separate zero positions; see `joints_by_axes`."""
-    joints_by_axes(robot)
+    """Raise an error for robots whose axes have no separate zero positions; see `joint_derivatives_by_axis`."""
+    joint_derivatives_by_axis(robot)
 
 
 def _refuse(request: ExportRequest) -> None:
@@ -127,7 +127,7 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         text=write_counts,
         read=read_offsets,
         check=check_robot,
-        parameters=joint_offsets,
+        parameters=joint_offset_indices,
         options=frozenset(("counts_per_turn", "present_counts")),
         refuse=_refuse,
         contains="joint_zeros",

@@ -10,7 +10,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     check_plain_joints,
     frame_sentences,
     untested_sentence,
-    with_frames,
+    with_frames_from_comments,
 )
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_input
@@ -76,7 +76,7 @@ def read_arm(text: str, source: str, nominal: Robot) -> Robot:
                 at=Place(source, element.sourceline, "b"),
             )
         row += np.array([values[name] for name in DH_COLUMNS]) * _FACTORS
-    return with_frames(nominal.with_geometry(dh=dh), text)
+    return with_frames_from_comments(nominal.with_geometry(dh=dh), text)
 
 
 def _parse(content: bytes, source: str) -> Any:

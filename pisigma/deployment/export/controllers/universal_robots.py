@@ -9,7 +9,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     FileContent,
     frame_sentences,
     untested_sentence,
-    with_frames,
+    with_frames_from_comments,
 )
 from pisigma.deployment.export.controllers.ur_models import (
     JOINTS,
@@ -69,7 +69,7 @@ def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
     dh = own.dh.copy()
     for key, column in KEYS.items():
         dh[:, column] += _numbers(text, key, source)
-    return with_one_row_per_joint(with_frames(own.with_geometry(dh=dh), text))
+    return with_one_row_per_joint(with_frames_from_comments(own.with_geometry(dh=dh), text))
 
 
 def _numbers(text: str, key: str, source: str) -> list[float]:

@@ -8,7 +8,11 @@ import torch
 from jaxtyping import Float64
 
 from pisigma.deployment.export.approximation import ApproximationProblem, solve_approximation
-from pisigma.deployment.export.controllers.controller_file import Convention, Frames, check_plain_joints
+from pisigma.deployment.export.controllers.controller_file import (
+    ControllerFrames,
+    Convention,
+    check_plain_joints,
+)
 from pisigma.files.errors import RobotError
 from pisigma.robot.chains import joint_origins, robot_of_origins
 from pisigma.robot.description import Robot
@@ -110,10 +114,10 @@ class ControllerGeometry:
         # After the last joint there is only the flange.
         return [*screws, _screw(end @ frame_of(self.described_robot.tool) @ inverse(self.T_flange_tool))]
 
-    def frames(self) -> Frames:
+    def frames(self) -> ControllerFrames:
         """Return the differences between the description's frames and the controller's."""
         base, tool = xyz_zyx_of(self.T_poses_base), xyz_zyx_of(self.T_flange_tool)
-        return Frames(self._sentence(), base, tool)
+        return ControllerFrames(self._sentence(), base, tool)
 
     def _sentence(self) -> str:
         base, tool = _frame_words(self.T_poses_base), _frame_words(self.T_flange_tool)

@@ -8,7 +8,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     FileContent,
     frame_sentences,
     untested_sentence,
-    with_frames,
+    with_frames_from_comments,
 )
 from pisigma.deployment.export.controllers.ur_models import (
     JOINTS,
@@ -113,7 +113,7 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     candidates = [[getattr(links, link).frame(order) for link in _LINKS] for order in (first, not first)]
     found = (c for c in candidates if calibration_hash(without_beta(c, own)) == links.hash)
     origins = next(found, candidates[0])
-    return robot_of_origins(with_frames(own, text), origins, np.eye(4))
+    return robot_of_origins(with_frames_from_comments(own, text), origins, np.eye(4))
 
 
 def calibration_hash(robot: Robot) -> str:

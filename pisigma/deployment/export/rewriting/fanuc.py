@@ -21,7 +21,7 @@ from pisigma.deployment.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     axes_in_use,
-    external_axes,
+    external_axes_reason,
     waypoint_groups,
 )
 from pisigma.robot.se3 import transform_from_xyz_zyx
@@ -141,7 +141,7 @@ class _Reader:
         values = _VALUES.match(self.text, match.start("body"))
         if values is None or "GP2" in match["body"]:
             return f"the values of P[{name}] cannot be read"
-        if used := external_axes(dict(_EXTERNAL.findall(match["body"])), self.axes_in_use):
+        if used := external_axes_reason(dict(_EXTERNAL.findall(match["body"])), self.axes_in_use):
             return f"{used} (P[{name}], line {self.scan.line_number(match.start())})"
         six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])

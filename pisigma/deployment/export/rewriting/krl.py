@@ -23,7 +23,7 @@ from pisigma.deployment.export.rewriting.scan import (
     ScannedProgram,
     argument_spans,
     axes_in_use,
-    external_axes,
+    external_axes_reason,
     mask_comments,
     numbers_in,
     waypoint_groups,
@@ -246,7 +246,7 @@ def _axes_in_use(scan: Scan, visible: str) -> dict[str, int]:
 def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | str:
     """Return the pose of a target, or the reason why external axes leave it unchanged."""
     values = {match[1].upper(): match[2].strip() for match in _EXTERNAL.finditer(literal[2])}
-    return external_axes(values, in_use) or _pose(literal)
+    return external_axes_reason(values, in_use) or _pose(literal)
 
 
 def _pose(literal: re.Match[str]) -> Pose:

@@ -23,7 +23,7 @@ from pisigma.deployment.export.rewriting.scan import (
     ScannedProgram,
     argument_spans,
     axes_in_use,
-    external_axes,
+    external_axes_reason,
     mask_comments,
     numbers_in,
     waypoint_groups,
@@ -243,7 +243,7 @@ def _axes(text: str) -> dict[str, str]:
 
 def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | str:
     """Return the pose of a robtarget, or the reason why it is left unchanged."""
-    return external_axes(_axes(literal[2]), in_use) or _not_normalised(literal[1]) or _pose(literal)
+    return external_axes_reason(_axes(literal[2]), in_use) or _not_normalised(literal[1]) or _pose(literal)
 
 
 def _product(literal: re.Match[str]) -> Frame | str:

@@ -229,10 +229,10 @@ class Scan:
         self._last_two = (self._last_two[0], target)
 
     def program(
-        self, names: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
+        self, named_poses: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
     ) -> ScannedProgram:
         """Return the collected program, without poses that are used in ways that are not understood."""
-        for pose in names.poses_used_elsewhere() if names else ():
+        for pose in named_poses.poses_used_elsewhere() if named_poses else ():
             self.mark_not_understood(pose)
         for span, target in self._targets.items():
             if span in self._unclear:
@@ -298,7 +298,7 @@ def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
     return {name: text for name, text in values.items() if not _is_zero(text) and not _is_absent(text)}
 
 
-def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
+def external_axes_reason(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
     """Return the reason why a pose with external axes is not changed; "" if no external axis is in use.
 
     The robot description has no external axes; it describes the robot with all of them at 0. A pose that does not state

@@ -138,17 +138,19 @@ class EdgeProfiles:
     gray_values: Float64[np.ndarray, "edges crossings samples"]
 
     @staticmethod
-    def from_image(image: Image, ends: Float64[np.ndarray, "edges 2 2"], clearance: float) -> "EdgeProfiles":
+    def from_image(
+        image: Image, ends: Float64[np.ndarray, "edges 2 2"], relative_edge_clearance: float
+    ) -> "EdgeProfiles":
         """Sample an image across edges.
 
         Args:
             image: the image.
             ends: pixels of both ends of every edge [px].
-            clearance: width of the uniform areas on both sides of an edge relative to its length, see
+            relative_edge_clearance: width of the uniform areas on both sides of an edge relative to its length, see
                 `Board.clearance`.
         """
         along = ends[:, 1] - ends[:, 0]
-        across = _FOLLOWED * clearance * np.stack([-along[:, 1], along[:, 0]], -1)
+        across = _FOLLOWED * relative_edge_clearance * np.stack([-along[:, 1], along[:, 0]], -1)
         at = ends[:, :1] + _ALONG[:, None] * along[:, None]
         sampled = at[:, :, None] + _ACROSS[:, None] * across[:, None, None]
         gray = map_coordinates(
@@ -186,7 +188,7 @@ def fit_saddles(
     gray: Float64[np.ndarray, "height width"],
     pixels: Float64[np.ndarray, "corners 2"],
     pixels_per_square: Float64[np.ndarray, "corners 2 2"],
-    clearance: float,
+    relative_edge_clearance: float,
 ) -> Float64[np.ndarray, "corners 2"]:
     """Fit corners between two black and two white squares by least squares over the surrounding pixels.
 
@@ -201,12 +203,12 @@ def fit_saddles(
         pixels: corners, accurate to half a pixel [px].
         pixels_per_square: derivative of pixels with respect to steps along rows and columns of squares, one in each
             column [px].
-        clearance: distance from a corner within which no other edge is printed, relative to a square.
+        relative_edge_clearance: distance from a corner within which no other edge is printed, relative to a square.
 
     Returns:
         The corners; those that a fit would move by more than `_MAX_SHIFT` are not changed.
     """
-    x, weight = _windows(gray.shape, pixels, pixels_per_square, clearance)
+    x, weight = _windows(gray.shape, pixels, pixels_per_square, relative_edge_clearance)
     values = gray[x[..., 1], x[..., 0]]
     x = x - pixels[:, None]
     state = np.zeros((len(pixels), 9))
