@@ -96,7 +96,7 @@ class AbstractFeature(ABC):
             state: joint values [rad or m], and further data of the rows.
         """
 
-    def columns_of_rows(self, state: JointState) -> Float64[Tensor, "rows dof columns"]:
+    def columns_of_rows(self, state: JointState) -> Float[Tensor, "rows dof columns"]:
         """Return the columns of measured rows, which may be stored: no derivative passes through them."""
         return self.columns(state)
 

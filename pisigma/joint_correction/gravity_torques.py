@@ -131,10 +131,11 @@ class GravityTorques(AbstractFeature):
         cells = torch.where(turning, cells, force) * self.used.to(q).view(*cells.shape[:3], 1)
         return cells.flatten(1, 2).movedim(-1, 0).reshape(*q.shape, 4 * self.robot.dof)
 
-    def columns_of_rows(self, state: JointState) -> Float64[Tensor, "rows dof columns"]:
+    def columns_of_rows(self, state: JointState) -> Float[Tensor, "rows dof columns"]:
         """Return the columns of measured rows, stored because a calibration needs those of the same rows many times."""
         q = state.q
-        if q.requires_grad or q.device.type != "cpu" or not 0 < len(q) <= _STORED_ROWS:
+        is_stored_type = q.dtype == torch.float64 and q.device.type == "cpu" and not q.requires_grad
+        if not (is_stored_type and 0 < len(q) <= _STORED_ROWS):
             return self.columns(state)
         return _stored_columns(self.robot, self.gravity, q.numpy().tobytes())
 

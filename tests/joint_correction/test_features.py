@@ -179,6 +179,8 @@ def test_columns_of_the_same_rows_are_computed_once():
             assert torch.equal(known[-1], feature.columns(JointState(values)))
             assert GravityTorques(robot, gravity).columns_of_rows(JointState(values.clone())) is known[-1]
     assert len({one.data_ptr() for one in known}) == len(known)
+    single = q[:4].float()  # half as many bytes
+    assert torch.equal(feature.columns_of_rows(JointState(single)), feature.columns(JointState(single)))
 
 
 def test_gravity_torques_do_not_depend_on_base_and_tool():

@@ -19,7 +19,7 @@ from pisigma.reporting.page.wording import TITLES, advice_for, dependence_text, 
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.held_out_rows import read_held_out
-from pisigma.validation.held_out.judged_rows import JudgedRows, judge_rows_of_file, judged_rows_of_folder
+from pisigma.validation.held_out.judged_rows import JudgedRows, judged_rows_of_file, judged_rows_of_folder
 from pisigma.validation.report.accuracy import (
     Accuracy,
     JudgedJoint,
@@ -265,7 +265,7 @@ def report_content(
     summary, held_out = CalibrationSummary.read(model), read_held_out(folder, model)
     rows = None if held_out is None else judged_rows_of_folder(model, held_out)
     if measurements is not None:
-        rows = judge_rows_of_file(model, measurements, held_out)
+        rows = judged_rows_of_file(model, measurements, held_out)
     causes = causes_of(summary, diagnostics)
     if rows is not None:
         remarks = (*(one.sentence for one in diagnostics), *remarks, *say("remarks_on_rows", rows))

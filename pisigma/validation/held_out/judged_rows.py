@@ -93,7 +93,7 @@ class JudgedRows:
         return math.sqrt(float((values - mean).square().sum()) / freedom) * 1e3
 
 
-def judge_rows_of_file(
+def judged_rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
     """Evaluate the rows of a file without training rows of the model; only rows marked as test if there are any.

@@ -68,7 +68,7 @@ class FrameCalibration(AbstractModelResult):
 def calibrate_frame(
     robot: Robot | CalibratedModel | HasModel | str | os.PathLike[str],
     data: Measurements | MeasurementFiles,
-    frame_choice: FrameChoice,
+    only: FrameChoice,
     cameras: CameraFiles | None = None,
 ) -> FrameCalibration:
     """Calibrate base, tool or both, with the arm held fixed, from 4 to 12 touches, positions, poses or images.
@@ -82,7 +82,7 @@ def calibrate_frame(
             or its folder).
         data: measurements, or CSV files of them; rows of the set "test" are not used. For a tool, rows of one socket
             are touches of one unknown point.
-        frame_choice: "tool" (with the base of the robot or model), "base" (with its tool) or "hand-eye" (both).
+        only: "tool" (with the base of the robot or model), "base" (with its tool) or "hand-eye" (both).
         cameras: cameras and boards, for files of detected board corners.
 
     Returns:
@@ -96,16 +96,12 @@ def calibrate_frame(
         PoseError: the joint values do not fit the robot.
     """
     started = time.perf_counter()
-    check_choice(IdentificationError, "only", frame_choice, _CHOICES)
+    check_choice(IdentificationError, "only", only, _CHOICES)
     model, parent = _model_of(robot)
     arm = _drawn(robot) if model is None else model.robot
     rows, _ = read_rows(data, arm, cameras).split_sets()
     try:
-        found = (
-            frames_of_robot(arm, rows, frame_choice)
-            if model is None
-            else frames_of_model(model, rows, frame_choice)
-        )
+        found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
     except IdentificationError as refusal:
         raise explain_refusal(refusal, arm, rows) from refusal
     diagnostics = check_rows_of_frames(rows, arm if model is None else model, found)
@@ -114,7 +110,7 @@ def calibrate_frame(
         found.fit, found.arm_variance, found.causes, parent, (*row_warnings(arm, rows), *warnings)
     )
     summary = summary.with_figures(
-        command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {frame_choice!r})",
+        command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})",
         diagnostics=diagnostics,
     )
     made = replace(found.model, metrics=summary.to_json())
@@ -140,7 +136,7 @@ def _model_of(robot: Source) -> tuple[CalibratedModel | None, ParentFigures | No
 
 
 def calibrate_frame_of_cell(
-    cell: Cell, frame_choice: FrameChoice, accept_implausible: bool = False
+    cell: Cell, only: FrameChoice, accept_implausible: bool = False
 ) -> tuple[FrameCalibration, ModelEntry | None]:
     """Calibrate base, tool or both with the newest session and the arm of the model in use, and store the model.
 
@@ -149,7 +145,7 @@ def calibrate_frame_of_cell(
 
     Args:
         cell: the cell.
-        frame_choice: what to calibrate.
+        only: what to calibrate.
         accept_implausible: store the model even if it must not be trusted.
 
     Returns:
@@ -163,13 +159,13 @@ def calibrate_frame_of_cell(
     parent = cell.history.in_use or next(reversed(cell.history.models()), None)
     if parent is None:
         session = cell.sessions.valid_sessions()[-1]
-        found = calibrate_frame(cell.robot, cell.sessions.rows_of([session]), frame_choice)
+        found = calibrate_frame(cell.robot, cell.sessions.rows_of([session]), only)
     else:
         cell.controller_warnings("calibrate", parent)
         session = cell.sessions.choose_session(parent, None)
         rows = cell.sessions.rows_of_file(session)
         seen = cell.sessions.rows_with_model_names(parent, rows, session.day)
-        found = calibrate_frame(cell.model_folder(parent.name), seen.rows, frame_choice)
+        found = calibrate_frame(cell.model_folder(parent.name), seen.rows, only)
     doubt = "" if found.trusted else found.diagnostics[0].sentence
     if doubt and not accept_implausible:
         refused = ("calibrate", "", session.name, "not_trusted", doubt)
@@ -179,7 +175,7 @@ def calibrate_frame_of_cell(
     save = partial(found.save, accept_implausible=accept_implausible)
     path = save_under_new_name(cell.folder / MODELS, save, taken)
     events = cell.history.events() if parent is None else ()
-    remark = f"{frame_choice} calibrated with session '{session.name}'"
+    remark = f"{only} calibrated with session '{session.name}'"
     entry = model_entry(events, started, path, [session], remark, found, parent)
     verdict = "accepted_implausible" if doubt else "trusted"
     check = Check("calibrate", entry.name, session.name, verdict, doubt or remark, None, False, started)
