@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float64, Int64
 
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
@@ -28,18 +29,18 @@ _DEGREES = math.degrees(1.0)
 _UNITS = {"kg": "kg", "c": "°C"}
 
 Untested = Literal["joint not moved", "too few rows"]
-"""Reason why a dependence on a joint was not tested."""
+"""Reason why a dependence on a joint or a condition was not tested."""
 
 
 @dataclass(frozen=True)
 class BinTest:
-    """Result of the Kruskal-Wallis test of differences of errors between bins of a joint's values.
+    """Result of the Kruskal-Wallis test of differences of errors between bins of values of a joint or a condition.
 
     Attributes:
         p_value: probability of such differences by chance.
         low: smallest RMS error of a bin.
         high: largest RMS error of a bin, in the unit of the errors.
-        worst_bin_edges: joint values that bound the bin with the largest RMS error, in the unit of the joint.
+        worst_bin_edges: values that bound the bin with the largest RMS error, in their unit.
     """
 
     p_value: float
@@ -88,28 +89,6 @@ class OrderTest:
         return self.p_value < SIGNIFICANT
 
 
-@dataclass(frozen=True)
-class PayloadOrTemperatureTest:
-    """Rank correlation (Spearman) of the length of the error with payload or temperature.
-
-    Attributes:
-        low: smallest stated value.
-        high: largest stated value.
-        correlation: rank correlation.
-        p_value: two-sided probability of such a correlation by chance.
-    """
-
-    low: float
-    high: float
-    correlation: float
-    p_value: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether the correlation is statistically significant."""
-        return self.p_value < SIGNIFICANT
-
-
 @dataclass(frozen=True, eq=False)
 class Dependence:
     """Errors as a function of a quantity, with a test of dependence.
@@ -130,7 +109,7 @@ class Dependence:
     values: Float64[np.ndarray, " rows"]
     errors: dict[str, Float64[np.ndarray, " rows"]]
     error_unit: str
-    test: BinTest | OrderTest | PayloadOrTemperatureTest | Untested
+    test: BinTest | OrderTest | Untested
 
 
 @dataclass(frozen=True)
@@ -215,17 +194,19 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
     groups = groups_of_equal_joints(rows.measurements.q).numpy()[judged]
     result = []
     for number, (axis, values) in enumerate(zip(robot.axes, q.T, strict=True), 1):
-        test = _over_joint(values, errors["after"], groups)
+        test = _over_bins(values, errors["after"], groups)
         result.append(Dependence(f"joint_{number}", axis.name, axis.file_unit, values, errors, unit, test))
     result.append(_over_order(rows, errors, judged, unit))
-    conditions = conditions_of(rows.measurements, CONDITIONS).numpy()[judged]
-    for name, values in zip(CONDITIONS, conditions.T, strict=True):
+    conditions = conditions_of(rows.measurements, CONDITIONS)
+    for name, column in zip(CONDITIONS, conditions.t(), strict=True):
         title, suffix = name.rsplit("_", 1)
+        values = column.numpy()[judged]
         stated = np.isfinite(values)
         if stated.sum() > 2 and np.ptp(values[stated]) > 0:
             those = {when: lengths[stated] for when, lengths in errors.items()}
-            found = _over_condition(values[stated], those["after"])
-            result.append(Dependence(title, title, _UNITS[suffix], values[stated], those, unit, found))
+            equal = groups_of_equal_joints(torch.cat([rows.measurements.q, column[:, None]], 1)).numpy()
+            test = _over_bins(values[stated], those["after"], equal[judged][stated])
+            result.append(Dependence(title, title, _UNITS[suffix], values[stated], those, unit, test))
     return tuple(result)
 
 
@@ -253,8 +234,11 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByFram
     return ErrorsByFrameOrTarget(tuple(result), unit, chance)
 
 
-def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:
-    """Test the dependence of errors on a joint's values; rows with equal joint values count once."""
+def _over_bins(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:
+    """Test the dependence of errors on values of a joint or a condition; rows of a group count once.
+
+    A test of bins also finds errors that are smallest at the mean value, as those of an effect that is not corrected.
+    """
     if len(errors) < 3 or np.ptp(values) == 0:
         return "joint not moved"
     bins = bin_errors(values, errors)
@@ -294,11 +278,6 @@ def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
     q = rows.measurements.q.numpy()
     r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
     return (None, 0.0) if max(r) < _ORDERED else (int(np.argmax(r)) + 1, max(r))
-
-
-def _over_condition(values: np.ndarray, errors: np.ndarray) -> PayloadOrTemperatureTest:
-    r, chance = rank_correlation(values, errors)
-    return PayloadOrTemperatureTest(float(values.min()), float(values.max()), r, chance)
 
 
 def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:

@@ -277,18 +277,23 @@ def test_gaps_of_joints_that_were_measured_in_part(name, tmp_path):
     assert any("theta_1" in line for line in report_content(model, tmp_path).advice)
 
 
-def test_a_dependence_on_temperature_is_found(hybrid, tmp_path):
+@pytest.mark.parametrize("quantity", ["payload", "temperature"])
+@pytest.mark.parametrize(
+    "mean", [0.0, 0.5]
+)  # from the first row on, and as an uncorrected effect: least at the mean
+def test_a_dependence_on_a_condition_is_found(hybrid, tmp_path, quantity, mean):
     arm, model = hybrid
     rows = measured(arm, 300, seed=9)
-    warm = torch.linspace(18, 30, 300, dtype=torch.float64)
-    off = torch.linspace(0, 2e-3, 300, dtype=torch.float64)[:, None] * torch.tensor([0.0, 1.0, 0.0])
-    content = report_content(model, tmp_path, replace(rows, temperature=warm, position=rows.position + off))
+    share = torch.linspace(0, 1, 300, dtype=torch.float64)
+    off = 4e-3 * (share - mean)[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    stated = {quantity: 18 + 12 * share}
+    content = report_content(model, tmp_path, replace(rows, position=rows.position + off, **stated))
     tests = {found.key: found.test for found in content.dependences}
-    assert tests["temperature"].significant
-    assert tests["temperature"].correlation > 0
+    assert tests[quantity].significant
+    assert tests[quantity].is_notable
     assert (tests["order"].component, tests["order"].significant) == ("y", True)
-    calm = report_content(model, tmp_path, replace(rows, temperature=warm))
-    assert not {found.key: found.test for found in calm.dependences}["temperature"].significant
+    calm = report_content(model, tmp_path, replace(rows, **stated))
+    assert not {found.key: found.test for found in calm.dependences}[quantity].significant
 
 
 def test_the_summary_is_json(hybrid, tmp_path):
