@@ -110,13 +110,33 @@ class ConditionFeatures(AbstractFeature):
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return products of conditions and functions of the joint values; 0 for mean, missing or NaN conditions."""
-        q = state.q
         if not any(name in state.conditions for name in self.names):
-            return q.new_zeros((*q.shape, self.count))
-        missing = torch.full_like(q[..., 0], torch.nan)
-        scaled = self.scaled_conditions(
-            torch.stack([state.conditions.get(name, missing).to(q) for name in self.names], -1)
-        )
+            return state.q.new_zeros((*state.q.shape, self.count))
+        return self._products(state, self.scaled_conditions(self._stated(state)))
+
+    def unstated_covariance_root(
+        self, state: JointState, weight: Float64[Tensor, "dof columns"]
+    ) -> Float[Tensor, "*batch dof sources"]:
+        """Return the effects of a standard deviation of unstated conditions, and of a temperature beyond the measured.
+
+        The latter is the difference between the proportional effect and the constant correction.
+        """
+        stated = self._stated(state)
+        beyond = self._scaled(stated) - self.scaled_conditions(stated)
+        off = torch.where(torch.isfinite(stated), beyond, 1.0)
+        products = [self._products(state, each) * weight for each in torch.diag_embed(off).unbind(-2)]
+        return torch.stack(products, -1).sum(-2)
+
+    def _stated(self, state: JointState) -> Float[Tensor, "*batch conditions"]:
+        """Return the conditions of every row [kg, deg C]; NaN if it does not state one."""
+        missing = torch.full_like(state.q[..., 0], torch.nan)
+        return torch.stack([state.conditions.get(name, missing).to(state.q) for name in self.names], -1)
+
+    def _products(
+        self, state: JointState, scaled: Float[Tensor, "*batch conditions"]
+    ) -> Float[Tensor, "*batch dof columns"]:
+        """Return products of scaled conditions and functions of the joint values."""
+        q = state.q
         turning = torch.tensor(self.robot.revolute, device=q.device)
         sine = torch.where(turning, q.sin(), scaled_joints(self.robot, q))
         cosine = torch.where(turning, q.cos(), torch.zeros_like(q))
@@ -137,10 +157,11 @@ class ConditionFeatures(AbstractFeature):
         low, high = stated_conditions.new_tensor(self.measured).unbind(-1)
         kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated_conditions.device)
         inside = torch.where(kept, stated_conditions.clamp(low, high), stated_conditions)
-        scaled = (inside - stated_conditions.new_tensor(self.mean)) / stated_conditions.new_tensor(
-            self.spread
-        )
+        scaled = self._scaled(inside)
         return torch.where(torch.isfinite(scaled), scaled, 0.0)
+
+    def _scaled(self, values: Float[Tensor, "*batch conditions"]) -> Float[Tensor, "*batch conditions"]:
+        return (values - values.new_tensor(self.mean)) / values.new_tensor(self.spread)
 
 
 def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:

@@ -11,6 +11,7 @@ from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, model_names_of_rows
+from pisigma.model.stated_conditions import mean_conditions
 
 
 def position_accuracy(
@@ -35,9 +36,9 @@ def position_accuracy(
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     if model.uncertainty is not None and len(rows):
         frame, target = (next(iter(known), "") for known in (model.bases, model.tools))
+        usual = mean_conditions(model) | model.conditions
         payload, temperature = (
-            torch.full((len(rows),), model.conditions.get(name, torch.nan), dtype=torch.float64)
-            for name in CONDITIONS
+            torch.full((len(rows),), usual.get(name, torch.nan), dtype=torch.float64) for name in CONDITIONS
         )
         sides = None
         if approach is not None:
@@ -72,7 +73,9 @@ def sigma_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
     frame = model_names_of_rows(model.bases, measurements.frame, "frame", measurements)
     target = model_names_of_rows(model.tools, measurements.target, "target", measurements)
     at, arm = replace(measurements, frame=frame, target=target), model.hybrid
-    return model.uncertainty.sigma(at, None if arm is None else arm.correction)
+    return model.uncertainty.sigma(
+        at, model.condition_correction or (None if arm is None else arm.correction)
+    )
 
 
 def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:

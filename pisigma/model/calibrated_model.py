@@ -13,6 +13,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.files.errors import MeasurementError, choice_remedy
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
@@ -98,6 +99,8 @@ class CalibratedModel:
         conditions: payload [kg] and temperature [deg C] at which the model is evaluated, by name; empty for the mean
             conditions of the calibration rows. See `pisigma.model.stated_conditions`.
         measured_conditions: lowest and highest calibrated value of every condition in `conditions` that was stated.
+        condition_correction: joint correction as a function of `conditions`, from which that of `hybrid` was made; None
+            without conditions.
         provenance: recipe, data and versions with which the model was made.
         metrics: figures that the card reports, by name.
     """
@@ -119,6 +122,7 @@ class CalibratedModel:
     training_values: RowValues | None = None
     conditions: dict[str, float] = field(default_factory=dict)
     measured_conditions: dict[str, tuple[float, float]] = field(default_factory=dict)
+    condition_correction: JointCorrection | None = None
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
 

@@ -81,7 +81,13 @@ def under_stated_conditions(
     measured = {
         name: ends for name, ends in zip(learned.names, learned.measured, strict=True) if name in stated
     }
-    return replace(model, hybrid=under, conditions={**usual, **stated}, measured_conditions=measured)
+    return replace(
+        model,
+        hybrid=under,
+        conditions={**usual, **stated},
+        measured_conditions=measured,
+        condition_correction=arm.correction,
+    )
 
 
 def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) -> CalibratedModel:
@@ -142,6 +148,13 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
         if learned is None:
             return sentences
         columns = conditions_of(rows, learned.names).unbind(1)
+        sentences += tuple(
+            f"{int(values.isnan().sum())} of {rows.rows} rows do not state {name}, whose effect {model.name} corrects: "
+            f"the mean of the calibration, {usual:.4g}, is used. The predicted accuracy includes deviations from it; "
+            "add the column."
+            for (name, usual), values in zip(mean_conditions(model).items(), columns, strict=True)
+            if bool(values.isnan().any())
+        )
         stated = [
             (name, low, high, values)
             for name, (low, high), values in zip(learned.names, learned.measured, columns, strict=True)
@@ -231,6 +244,12 @@ def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
     ):
         dh[row, 0 if is_revolute else 1] += direction * value
     return robot.with_geometry(dh=dh)
+
+
+def mean_conditions(model: CalibratedModel) -> dict[str, float]:
+    """Return the means over the calibration rows [kg, deg C] of the conditions that a model corrects, by name."""
+    learned = _learned(model)
+    return {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
 
 
 def learned_range(model: CalibratedModel, condition: str) -> tuple[float, float] | None:

@@ -17,13 +17,14 @@ from pisigma.joint_correction.conditions import ConditionFeatures, learned_condi
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.stated_conditions import condition_warnings, under_stated_conditions
+from pisigma.model.stated_conditions import condition_warnings, mean_conditions, under_stated_conditions
 from pisigma.reporting.page.content import report_content
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
@@ -92,9 +93,8 @@ def test_both_routes_reach_poses_under_the_conditions(name: str) -> None:
         assert_close(torch.as_tensor(found.q), q, atol=1e-9)
 
 
-def test_the_accuracy_is_that_of_the_conditions() -> None:
-    arm = hybrid_of("rb5", features=("gravity", "conditions", "series"), payloads=(0.0, 20.0))
-    model = model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements)
+def test_the_accuracy_is_that_of_the_conditions(loaded_arm) -> None:
+    arm, model = loaded_arm
     q = joints_in(arm.true.nominal, 30, seed=7)
     rows = Measurements(q=q, payload=torch.full((30,), 20.0, dtype=torch.float64))
     expected = sigma_of_rows(model, rows).norm(dim=-1)
@@ -162,6 +162,7 @@ def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_p
                 if "temperature_c" in sentence
             ]
             assert ([9, 30, 35.5, 39.5, 15, 35] in numbers) is expected
+            assert ([30, 30, 25] in numbers) is (judged.temperature is None)
     assert condition_warnings(hybrid_model("kiro4", [FourierSeries(model.robot, 2)]), warm) == ()
 
 
@@ -174,6 +175,46 @@ def test_impossible_conditions_are_refused(name: str, value: float) -> None:
         CorrectedIK(model_with("kiro4", "all")).under(**{name: value})
     assert str(caught.value.value) == str(value)
     assert caught.value.expected
+
+
+@pytest.fixture(scope="module")
+def loaded_arm():
+    arm = hybrid_of("rb5", features=("gravity", "conditions", "series"), payloads=(0.0, 20.0))
+    return arm, model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements)
+
+
+def test_the_accuracy_of_rows_without_a_condition_includes_its_effect(loaded_arm) -> None:
+    arm, model = loaded_arm
+    q = joints_in(arm.true.nominal, 30, seed=7)
+    (mean,) = mean_conditions(model).values()
+    learned = learned_conditions(model.hybrid.correction)
+    at = [rows_under(q, mean + step * learned.spread[0], 20.0) for step in (0, 1)]
+    effect = poses_of_rows(model, at[1])[:, :3, 3] - poses_of_rows(model, at[0])[:, :3, 3]
+    unstated = replace(at[0], payload=None)
+    assert_close(sigma_of_rows(model, unstated), sigma_of_rows(model, at[0]).hypot(effect), rtol=1e-2)
+    assert float(effect.norm(dim=1).median()) > 0.3 * float(sigma_of_rows(model, at[0]).norm(dim=1).median())
+    (sentence,) = condition_warnings(model, unstated)
+    assert numbers_in(sentence)[:2] == [30, 30]
+    assert_close(CorrectedIK(model).accuracy(q), sigma_of_rows(model, at[0]).norm(dim=-1))
+
+
+def test_the_accuracy_beyond_the_measured_temperatures_includes_the_effect_that_is_held_constant() -> None:
+    model = model_with("kiro4", "all")
+    learned, q = learned_conditions(model.hybrid.correction), joints_around("kiro4", 20, seed=3)
+    weight = model.hybrid.correction.linear[-1].detach()
+    inside, edge, beyond = (
+        learned.unstated_covariance_root(
+            JointState(q, {"payload_kg": torch.full((20,), 9.0), "temperature_c": torch.full((20,), value)}),
+            weight,
+        )
+        for value in (20.0, 35.0, 41.0)
+    )
+    assert_close(inside, torch.zeros_like(inside))
+    assert_close(edge, torch.zeros_like(edge))
+    one = [
+        learned.columns(JointState(q, {"temperature_c": torch.full((20,), value)})) for value in (25.0, 31.0)
+    ]
+    assert_close(beyond.sum(-1), ((one[1] - one[0]) * weight).sum(-1), atol=1e-15)
 
 
 def test_conditions_that_were_not_learned_are_refused(tmp_path) -> None:

@@ -144,7 +144,7 @@ def advice_for(
         *say("other_rows", model, held_out),
         *say("joint_gaps", partly_measured_joints(model, rows), model),
         *say("rows_outside", outside_errors(rows)),
-        *(() if rows is None else condition_warnings(model, rows.measurements)),
+        *(() if rows is None or _are_stored(rows) else condition_warnings(model, rows.measurements)),
     )
     if summary is None:
         return _once(*causes, *of_rows, *_conditions(rows))
@@ -205,7 +205,7 @@ def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
     """Return sentences on the payload and the temperature for which the figures are valid."""
-    if rows is None or (rows.row_origin == "held_out" and rows.measurements.position is None):
+    if rows is None or _are_stored(rows):
         return []
     lines: list[str] = []
     for values, name, unit, little in (
@@ -217,3 +217,8 @@ def _conditions(rows: JudgedRows | None) -> list[str]:
         if low is None or high is None or high - low < little:
             lines += say("condition", name, unit, low, high)
     return lines
+
+
+def _are_stored(rows: JudgedRows) -> bool:
+    """Return whether the rows are those that a model folder stores, which does not store their conditions."""
+    return rows.row_origin == "held_out" and rows.measurements.position is None

@@ -6,6 +6,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.backlash import with_approach_by_order
 from pisigma.validation.checks.camera import check_camera
 from pisigma.validation.checks.check import Check, CheckedCalibration, RowCheck
+from pisigma.validation.checks.conditions import check_conditions, check_temperature
 from pisigma.validation.checks.lag import check_lag
 from pisigma.validation.checks.mixed_rows import check_mixed_rows, check_two_populations
 from pisigma.validation.checks.other_robot import check_other_robot, check_other_robot_of_rows
@@ -16,7 +17,6 @@ from pisigma.validation.checks.scale import check_scale, check_scale_of_rows
 from pisigma.validation.checks.search import check_convergence, check_few_rows
 from pisigma.validation.checks.setup_fault import check_setup_fault, check_setup_of_rows
 from pisigma.validation.checks.stated_noise import check_stated_noise
-from pisigma.validation.checks.temperature import check_temperature
 from pisigma.validation.checks.torques import check_torques
 from pisigma.validation.checks.unexplained import (
     check_residual_size,
@@ -42,6 +42,7 @@ _CHECKS: tuple[Check, ...] = (
     check_unexplained,
     check_few_rows,
     check_temperature,
+    check_conditions,
     check_torques,
     check_camera,
 )

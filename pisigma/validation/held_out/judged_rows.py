@@ -17,6 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
+from pisigma.model.stated_conditions import mean_conditions
 from pisigma.model.training_rows import training_row_mask, training_row_warnings
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyz_zyx
@@ -144,7 +145,11 @@ def judged_rows_of_file(
 
 
 def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
-    """Return the held-out rows that a model folder stores, as `JudgedRows`."""
+    """Return the held-out rows of a model folder as `JudgedRows`, at the mean conditions of the calibration."""
+    conditions = {
+        name.rsplit("_", 1)[0]: torch.full((len(held_out.q),), value, dtype=torch.float64)
+        for name, value in mean_conditions(model).items()
+    }
     rows = Measurements(
         q=held_out.q,
         frame=held_out.frame,
@@ -152,6 +157,7 @@ def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> Judg
         line=held_out.line,
         source=model.provenance.data_source,
         origin=held_out.origin,
+        **conditions,
     )
     origins = ("held_out", "held_out")
     judged = _judged(model, rows, held_out.errors_by_model, held_out.residual, origins)

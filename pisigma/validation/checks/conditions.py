@@ -1,9 +1,10 @@
-"""Check whether the temperatures of the rows are plausible for a robot in degrees Celsius."""
+"""Check whether all rows state a condition, and whether temperatures are plausible in degrees Celsius."""
 
 from collections.abc import Iterator
 
 import torch
 
+from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -29,3 +30,22 @@ def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             rows=tuple(rows.place(row) for row in hot),
             values={"hottest": rows.place(most), "temperature": float(rows.temperature[most])},
         )
+
+
+def check_conditions(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn about a payload or temperature that only some rows state, so that its effect is not learned."""
+    rows = checked.rows
+    for name, values in zip(CONDITIONS, conditions_of(rows, CONDITIONS).t(), strict=True):
+        missing = values.isnan().nonzero()[:, 0].tolist()
+        if 0 < len(missing) < rows.rows:
+            remedy = f"Add it to these rows (0 kg without a payload), or remove the column {name}."
+            yield Diagnostic(
+                kind="conditions",
+                severity="warning",
+                sentence=f"expected {name} in every row, got none in {len(missing)} of {rows.rows} rows (the first is "
+                f"{rows.place(missing[0])}): its effect is not learned and remains as an error. {remedy}",
+                rows=tuple(rows.place(row) for row in missing),
+                cause=name,
+                values={"missing": len(missing)},
+                remedy=remedy,
+            )
