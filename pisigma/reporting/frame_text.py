@@ -164,11 +164,15 @@ def base_rows(figures: ArmBaseFigures) -> list[tuple[str, ...]]:
 
 
 def rotation_lines(summary: ArmsSummary) -> list[str]:
-    """Return a sentence on the standard errors of the rotation of every base."""
+    """Return a sentence on the standard errors of the rotation of every base, and on what bases include."""
     return [
-        f"The rotation of the base of '{one.arm}' about x, y, z of '{one.other_arm}' has standard errors of "
-        f"{', '.join(rounded_text(error, 0) for error in one.standard_errors[3:])} deg."
-        for one in summary.bases
+        "A base belongs to the calibrated model of its arm: it includes the errors of the height and zero of the first "
+        "joint (such as base_z + d_1 and base_roll + theta_1), by which it differs from the mounting of the arm.",
+        *(
+            f"The rotation of the base of '{one.arm}' about x, y, z of '{one.other_arm}' has standard errors of "
+            f"{', '.join(rounded_text(error, 0) for error in one.standard_errors[3:])} deg."
+            for one in summary.bases
+        ),
     ]
 
 

@@ -19,7 +19,10 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class ArmBaseFigures(StoredFigures):
-    """Base of an arm relative to the base of another arm.
+    """Base of an arm relative to the base of another arm, both as in their calibrated models.
+
+    A base includes the errors of the height and zero of the first joint, which rows cannot separate from it; standard
+    errors do not include the difference from the mounting of the arm.
 
     Attributes:
         arm: name of the arm.

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, ModelError, Place
+from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
@@ -146,10 +147,10 @@ def judged_rows_of_file(
 
 def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
     """Return the held-out rows of a model folder as `JudgedRows`, at the mean conditions of the calibration."""
-    conditions = {
-        name.rsplit("_", 1)[0]: torch.full((len(held_out.q),), value, dtype=torch.float64)
-        for name, value in mean_conditions(model).items()
-    }
+    payload, temperature = (
+        torch.full((len(held_out.q),), usual, dtype=torch.float64) if usual is not None else None
+        for usual in map(mean_conditions(model).get, CONDITIONS)
+    )
     rows = Measurements(
         q=held_out.q,
         frame=held_out.frame,
@@ -157,7 +158,8 @@ def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> Judg
         line=held_out.line,
         source=model.provenance.data_source,
         origin=held_out.origin,
-        **conditions,
+        payload=payload,
+        temperature=temperature,
     )
     origins = ("held_out", "held_out")
     judged = _judged(model, rows, held_out.errors_by_model, held_out.residual, origins)
