@@ -87,7 +87,7 @@ class PlanSettings:
 
     Attributes:
         count: number of poses to calibrate with.
-        check: number of additional poses to verify the calibration with (rows of the set test).
+        check: number of additional poses to verify the calibration with (rows of the set "test").
         sensor: what is measured: position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
             board).
         camera: camera and board, for the sensor camera only.

@@ -106,7 +106,7 @@ def ik(
 def _for_task(
     solver: "CorrectedIK", ignore: str | None, mm: str | None, deg: str | None, elbow_deg: float | None
 ) -> "CorrectedIK":
-    """Return the solver for the axes of the tool that the options do not ignore."""
+    """Return the solver with the ignored axes, the tolerances and the elbow angle that the options state."""
     return solver.for_task(
         None if ignore is None else [name for name in _words(ignore) if name != "none"],
         _numbers("--tolerance-mm", mm),

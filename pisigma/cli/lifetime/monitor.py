@@ -42,7 +42,8 @@ def monitor(
     """Check in every session whether the robot has changed, and track its drift over months.
 
     Each call adds its sessions to the history: that of the cell, or MODEL.history.sqlite next to a model folder outside
-    a cell. Exits with status 3 if recalibration is worthwhile, or if a control chart or the error exceeds its limits.
+    a cell. Exits with status 3 if rows are implausible, a recalibration is recommended, a control chart raises an
+    alarm, or the error exceeds its limit.
     """
     from pisigma.files.output_file import check_page
     from pisigma.workflow import monitor as workflow

@@ -126,8 +126,8 @@ def solve_images(
         f"the images do not determine the intrinsics of camera '{camera.name}'",
         value=camera.name,
         at=Place(source),
-        remedy="take images tilted by up to 40 deg in which the board fills the whole frame, or keep the intrinsics "
-        "closer to a calibration (--set intrinsics=prior)",
+        remedy="take images tilted by up to 40 deg in which the board covers all parts of the frame; to calibrate an "
+        "arm, you can also fix the intrinsics (--set intrinsics=fixed)",
     )
 
 

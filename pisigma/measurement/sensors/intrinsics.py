@@ -48,13 +48,13 @@ paper."""
 
 @dataclass(frozen=True, eq=False)
 class ImageIntrinsics:
-    """Information of the corners of images on their camera's intrinsics k, linearised at `intrinsics`.
+    """Information from the corners of images about their camera's intrinsics k, linearised at `intrinsics`.
 
     Attributes:
         pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
             respect to k.
-        information_root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit
-            variances.
+        information_root: matrix of the equations of k with the poses eliminated, `root (k - intrinsics) = residual`
+            with unit variances.
         residual: right-hand side of the equations of `information_root`.
         intrinsics: intrinsics at which the images were linearised.
         prior_mean: intrinsics of the camera file, the prior mean.

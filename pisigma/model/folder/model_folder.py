@@ -260,7 +260,7 @@ def _build_model(
 def _training_values(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
         raise InconsistentFolderError(
-            "the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0]
+            f"the tensors {', '.join(_ROWS)} differ in their number of rows", file=WEIGHTS, value=_ROWS[0]
         )
     return RowValues.stored_values(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 

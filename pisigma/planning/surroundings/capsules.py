@@ -123,7 +123,7 @@ class Capsules:
         return torch.stack([first, second], -1)[checked]
 
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
-        """Draw joint values within the limits [rad or m], the same ones in every call."""
+        """Draw joint values within the limits and half a turn of zero [rad or m], the same ones in every call."""
         generator = torch.Generator().manual_seed(0)
         limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
         draws = torch.rand(_SAMPLES, len(limits), generator=generator, dtype=torch.float64)
@@ -139,7 +139,7 @@ class _Piece(NamedTuple):
     Attributes:
         row: row to whose link the piece belongs.
         carries_robot: see `Capsules`.
-        frame: frames to which the ends are fixed.
+        frame: indices of the frames to which the ends are fixed.
         point: positions of the ends in these frames [m].
     """
 

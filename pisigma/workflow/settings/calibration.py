@@ -216,6 +216,6 @@ class CalibrationSettings:
 
 
 WITH_PRIOR = (
-    "a calibration with a fleet prior estimates all parameters of a hybrid, and is cross-validated row by row"
+    "a calibration with a fleet prior always estimates all parameters of a hybrid, and chooses its cross-validation"
 )
 """Why a calibration with a prior uses few settings."""

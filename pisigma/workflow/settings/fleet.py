@@ -17,8 +17,8 @@ class FleetSettings:
         engine: where to run: processes (on this machine) or ray.
         jobs: number of processes that work in parallel. None: one per core.
         address: address of a Ray cluster. None: Ray on this machine.
-        prior: model folder written by `pisigma fleet prior`, from which the calibrations start. The settings of
-            the calibrations are then ignored, and every row is cross-validated.
+        prior: model folder written by `pisigma fleet prior`, from which the calibrations start. Cells that state
+            settings of the calibration are then refused.
 
     Raises:
         FleetError: a setting is not a valid choice, or `jobs` is less than 1.

@@ -14,7 +14,8 @@ class MeasureSettings:
 
     Attributes:
         limit_mm: stop when the expected 95 % quantile of the tool's position errors is below this [mm].
-        least_gain_mm: stop when 10 more poses would lower the expected 95 % quantile by less than this [mm].
+        least_gain_mm: stop when 10 more poses would lower the expected 95 % quantile of the errors by less than
+            this [mm].
         every: number of rows between updates of the accuracy and of the plan.
         replan: replan the remaining poses.
 

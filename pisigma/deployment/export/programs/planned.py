@@ -9,8 +9,8 @@ from pisigma.deployment.export.programs.languages import COUNTING, LANGUAGES, Pr
 from pisigma.planning.plan_file import StoredPlan
 
 TEST = (
-    "TEST IT AT LOW SPEED FIRST: the poses and the motions between them avoid the obstacles that the cell states. "
-    "Nothing else was checked, nor was the motion to the first pose."
+    "TEST IT AT LOW SPEED FIRST: the poses and the motions between them keep the joint limits, and the arm touches "
+    "neither itself nor the stated obstacles. Nothing else was checked, not even the motion to the first pose."
 )
 
 
