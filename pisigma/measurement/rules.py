@@ -383,7 +383,7 @@ def _pair_fault(
     first, second = rows
     for row in rows:
         if not sound[row]:
-            problem = f"pair '{name}' lacks a row, as {place(row)} cannot be used"
+            problem = f"pair '{name}' lacks a row, because {place(row)} cannot be used"
             return Fault(problem, column, value=name, remedy="correct that row")
     frame = data.text("frame")
     if frame[first] != frame[second]:

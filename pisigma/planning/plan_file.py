@@ -163,11 +163,11 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
     if file.suffix.lower() == ".csv":
         if not yaml_of(file).exists():
             raise PlanningError(
-                f"expected a plan, but there is no {yaml_of(file).name} next to it",
+                f"expected a plan, but there is no {yaml_of(file).name} next to this file",
                 expected="a plan",
                 value=yaml_of(file).name,
                 at=Place(file),
-                remedy="give the poses that `pisigma plan` wrote",
+                remedy="give the CSV file that `pisigma plan` wrote, and keep its YAML file next to it",
             )
         file = yaml_of(file)
     document = read_yaml(file, PlanDocument, PlanningError)

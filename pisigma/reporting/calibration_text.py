@@ -141,7 +141,7 @@ def scale_text(scale: ScaleFigures) -> str:
     return (
         f"scale of the sensor: the estimated lengths of the arm are {scale.factor:.{digits}f} +- "
         f"{scale.sigma:.{digits}f} times the nominal ones; the odds of one common factor, such as a wrong scale of the "
-        f"sensor, against an error of each link are {scale.odds:.2g} to 1. {scale_error_text(scale)}"
+        f"sensor, against independent errors of the links are {scale.odds:.2g} to 1. {scale_error_text(scale)}"
     )
 
 

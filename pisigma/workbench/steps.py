@@ -175,7 +175,7 @@ def _in_cell(text: ResultText, cell: Cell) -> ResultText:
 
 
 def incoming_rows(files: list[Path], cell: Cell, form: Form) -> IncomingRows:
-    """Return uploaded files with the settings by which they are read into the cell.
+    """Return uploaded files with the settings for importing them into the cell.
 
     Args:
         files: uploaded files.

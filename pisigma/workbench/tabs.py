@@ -114,7 +114,7 @@ class Tabs:
         )
 
     def render_page(self, folder: Path, cell: Cell | None, is_broken: bool = False) -> str:
-        """Return the frame of the page, without the content of a tab; without a cell, there is only one tab.
+        """Return the page without the content of its tabs; without a cell, there is only one tab.
 
         Args:
             folder: folder of the cell.

@@ -102,7 +102,7 @@ def _curve_lines(planned: Plan) -> list[str]:
         needed = (
             f"with {planned.poses_needed} poses" if planned.poses_needed else "already, without more poses"
         )
-        lines.append(f"95 % of the errors are expected below {limit:g} mm {needed}.")
+        lines.append(f"95 % of the errors are expected to be below {limit:g} mm {needed}.")
     return lines
 
 

@@ -54,7 +54,7 @@ SEARCHED_ROWS = 4_000
 _GROSS = 50.0
 """Largest residual of rows used for the first model, in standard deviations of the geometric calibration."""
 
-_NOTHING_FOUND = "The data show nothing beyond the geometry, so the geometric calibration is kept."
+_NOTHING_FOUND = "The data show no errors beyond those of the geometry, so the geometric calibration is kept."
 
 _TOO_FEW_ROWS = (
     "A joint correction would use up nearly all degrees of freedom of these few rows, so the geometric "

@@ -11,8 +11,8 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import angle_per_joint_value
 
 HIGHEST_ORDER = 3_000
-"""Highest order of a line [1/turn]. Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of
-0.1 mrad shifts the phase of the highest order by 0.3 rad."""
+"""Highest order of a line [1/turn]. Motors with 10 pole pairs and gear ratios of 101:1 have cogging at 2,020; an error
+of 0.1 mrad shifts the phase of the highest order by 0.3 rad."""
 _MAX_LINES = 8
 """Largest number of lines per joint."""
 _ALIKE = 0.9

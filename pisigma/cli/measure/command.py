@@ -127,7 +127,7 @@ def measure(
     view: View = False,
     as_json: AsJson = False,
 ) -> None:
-    """Check rows as they are measured: wrong rows, the next pose of the plan, the accuracy, and when to stop.
+    """Check rows as they are measured, and state wrong rows, the next pose, the accuracy, and when to stop.
 
     Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: if the remaining poses are planned
     again, they are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end.

@@ -35,7 +35,7 @@ RegionMm = Annotated[
 ]
 Joints = Annotated[
     Path | None,
-    typer.Option(help="CSV file of joint values (q1_deg and so on) that fill the region."),
+    typer.Option(help="CSV file of joint values (q1_deg and so on) that cover the region."),
 ]
 Orders = Annotated[
     str | None,

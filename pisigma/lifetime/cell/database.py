@@ -139,7 +139,7 @@ def file_system_type(path: str, mounts: Iterable[tuple[str, str]]) -> str | None
     """Return the type of the file system that contains a path.
 
     Args:
-        path: an absolute path without links.
+        path: an absolute path without symbolic links.
         mounts: mount points and types in the order of mounting; a later mount hides an earlier mount at the same place.
 
     Returns:

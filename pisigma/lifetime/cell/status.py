@@ -137,7 +137,7 @@ def _to_measure(facts: CellFacts, plan: str) -> Step:
 
 
 def _several_arms(facts: CellFacts) -> Step | None:
-    why = f"its arms are calibrated with `{facts.command('calibrate')}`; use the models of one arm then"
+    why = f"`{facts.command('calibrate')}` calibrates its arms; other commands take the model and files of one arm"
     return Step("several_arms", why) if facts.has_several_arms else None
 
 

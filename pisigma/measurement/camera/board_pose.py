@@ -36,7 +36,7 @@ class BoardPose:
         intrinsics_jacobian: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame
             [rad]) with respect to the intrinsics.
         information_root: square root of the corners' information on the intrinsics k, with the pose eliminated and a
-            noise of 1 px: `root (k - present) = residual`.
+            noise of 1 px: `root (k - k0) = residual` with the intrinsics k0 of the camera.
         residual: right-hand side of the equation of `information_root` [px].
     """
 

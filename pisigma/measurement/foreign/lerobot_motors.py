@@ -166,8 +166,8 @@ def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor]
     motor = motors[name]
     if motor.drive_mode:
         raise MeasurementError(
-            f"the direction of the normalized values of '{name}' depends on the bus: LeRobot reverses drive_mode 1 "
-            "for Feetech and not for Dynamixel motors",
+            f"the direction of the normalized values of '{name}' depends on the bus: LeRobot reverses "
+            "joints with drive_mode 1 on Feetech motors, but not on Dynamixel motors",
             value=name,
             option="calibration",
             remedy="record degrees, or set drive_mode to 0 and reverse the joint of the robot",

@@ -294,12 +294,12 @@ def stopping_advice(
     limit = "" if limit_mm is None else f"; the limit is {limit_mm:g} mm"
     if reached_accuracy:
         point = reached_accuracy[-1]
-        now = f"95 % of the errors are expected below {point.predicted_p95 * 1e3:.3f} mm"
+        now = f"95 % of the errors are expected to be below {point.predicted_p95 * 1e3:.3f} mm"
         below = [
             limit_mm is not None and one.predicted_p95 * 1e3 <= limit_mm for one in reached_accuracy[-2:]
         ]
         if len(below) > 1 and all(below):
-            return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
+            return Advice("stop", f"Stop: with {point.poses} poses, {now}{limit}.")
         confirm = ", which the next poses must confirm" if below[-1] else ""
         ahead = next((one for one in expected_accuracy if one.poses >= point.poses + _AHEAD), None) or next(
             reversed(expected_accuracy), None

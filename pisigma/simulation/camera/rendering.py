@@ -205,9 +205,10 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
 def _on_surface(
     board: TrueBoard, T_camera_board: Float64[np.ndarray, "_rows 4 4"], rays: np.ndarray
 ) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
-    """Return the points at which rays meet the board, in its frame [m], and their depths [m], `FAR` for no point.
+    """Return the points at which rays meet the board, in its frame [m], and their depths [m].
 
-    There is one pose of the board for each row of rays, or one for all.
+    The depth is `FAR` if a ray does not meet the board. There is one pose of the board for each row of rays, or one for
+    all.
     """
     R, t = T_camera_board[:, :3, :3, None], T_camera_board[:, :3, 3, None]
     origin = [-(R[:, :, axis] * t).sum(1) for axis in range(3)]

@@ -58,8 +58,8 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             kind="rounding",
             severity="warning",
             sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-            f"causes position errors of {length_text(rounding.rms_error)} RMS, {100 * rounding.error_share:.0f} % of "
-            "the squared errors of the rows; log them with more decimals.",
+            f"causes position errors of {length_text(rounding.rms_error)} RMS ({100 * rounding.error_share:.0f} % of "
+            "the squared errors of the rows); log them with more decimals.",
             cause="joint_values",
             values={"error_mm": rounding.rms_error * 1e3, "share": rounding.error_share},
         )

@@ -112,8 +112,8 @@ def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] |
 def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]:
     """Return predicted poses, with frames and tools fitted to the rows that are not far off.
 
-    Suspicious rows are replaced by their predictions before the next fit. This converges to the fit of the other rows,
-    and which rows are suspicious is decided again in every iteration.
+    Suspicious rows are replaced by their predictions before the next fit. The suspicious rows are selected again in
+    every iteration, and the fits converge to that of the other rows.
     """
     T = judged.predicted
     for _ in range(_REFITS):

@@ -157,7 +157,7 @@ class _Fit:
 
     @property
     def shifts(self) -> Float64[np.ndarray, "own values"]:
-        """Changes of the rows' values by the motion."""
+        """Changes of the rows' values due to the motion."""
         shifts: np.ndarray = self.candidate.columns @ self.motion
         return shifts
 

@@ -156,7 +156,7 @@ def thermal_component(
     reference = f"{mean:.1f} deg C of the calibration" if low == high else f"{low:.1f} to {high:.1f} deg C"
     a = expansion_per_k * model.robot.reach * span
     source = f"{expansion_per_k:g} /K, reach {model.robot.reach:.3f} m, sessions up to {span:.1f} K from {reference}"
-    return Component(f"{what} that is not compensated", "B", a / math.sqrt(3), math.inf, source)
+    return Component(f"uncompensated {what}", "B", a / math.sqrt(3), math.inf, source)
 
 
 def _noise(model: CalibratedModel) -> NoiseFigures | None:

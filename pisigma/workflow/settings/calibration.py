@@ -216,6 +216,6 @@ class CalibrationSettings:
 
 
 WITH_PRIOR = (
-    "a calibration with a fleet prior always estimates all parameters of a hybrid, and chooses its cross-validation"
+    "a calibration with a fleet prior always estimates all parameters of a hybrid, and chooses its folds"
 )
 """Why a calibration with a prior uses few settings."""

@@ -33,8 +33,8 @@ COUNTING = (
 _CARTESIAN = (
     "Poses are those of the nominal robot at the corrected joint values: the controller has to compute with the "
     "nominal robot, and its accuracy options have to be off.",
-    "Frame and tool are those of the model, relative to the origin and to the last row of the robot description, which "
-    "have to be the controller's origin and flange.",
+    "The frame of the model is relative to the origin of the robot description, which has to be that of the "
+    "controller; its tool is relative to the last row, which has to be the controller's flange.",
 )
 
 

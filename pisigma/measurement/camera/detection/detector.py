@@ -172,9 +172,9 @@ def detect_boards(
     reasons = [f"{one.name}: {one.board.reason}" for one in images if isinstance(one.board, NoBoard)]
     if len(reasons) == len(files):
         raise MeasurementError(
-            f"none of {len(files)} images can be used ({reasons[0]})",
+            f"none of the {len(files)} images can be used (for example, {reasons[0]})",
             value=len(files),
-            remedy="check the board's rows and columns and the light",
+            remedy="check the rows and columns of the board, and the lighting",
         )
     return images
 
