@@ -8,7 +8,7 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC, complete_export
 from pisigma.cli.cell import cell_at, output_in_cell
 from pisigma.cli.endings import NOT_ACCEPTED, exit_with_error
-from pisigma.cli.output import print_json, print_line
+from pisigma.cli.output import print_json, print_line, print_lines
 from pisigma.deployment.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
@@ -152,10 +152,10 @@ def export(
         temperature_c=temperature_c,
     )
     exported = export_model(form, request) if cell is None else export_from_cell(cell, form, request)
-    _print(exported, form, out, kind.contents, as_json)
+    _print(exported, form, out, kind.title, as_json)
 
 
-def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:
+def _print(exported: "Exported", form: str, out: Path, title: str, as_json: bool) -> None:
     """Print what was written, and warnings on stderr."""
     for sentence in exported.warnings:
         print_line(f"pisigma: {sentence}", to_stderr=True)
@@ -163,10 +163,9 @@ def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: b
         remarks = [*exported.remarks, *exported.warnings]
         print_json({"file": str(out), "format": form, **exported.facts, "remarks": remarks})
     else:
-        for line in (*exported.leading_text.splitlines(), *exported.remarks):
+        for line in exported.leading_text.splitlines():
             print_line(line)
-        what = exported.summary or contents[0].upper() + contents[1:]
-        print_line(f"{what} written to {out}{exported.details}.")
+        print_lines([*exported.remarks, f"{exported.summary or title} written to {out}{exported.details}."])
     if exported.failure:
         exit_with_error(exported.failure)
     if exported.missed_limit:

@@ -7,7 +7,7 @@ from typing import Any
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
 from pisigma.reporting.result_text import Block, ResultText, sentence_block, table_block
-from pisigma.reporting.verdict import Verdict
+from pisigma.reporting.verdict import Verdict, uncapitalised
 from pisigma.robot.kinematics.status import Status
 
 QUANTITIES = ("q", "q_nominal", "correction")
@@ -15,6 +15,9 @@ QUANTITIES = ("q", "q_nominal", "correction")
 
 FAILURES = tuple(status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN))
 """Statuses that end a command with exit status 2."""
+
+_TRUST = {Status.REACHED: "yes", Status.OUTSIDE_DOMAIN: "with caution"}
+"""Whether to trust joint values with a status; no for all others."""
 
 
 def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
@@ -25,10 +28,12 @@ def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
     found = (
         f"{reached} of {len(statuses)} solutions reach" if len(statuses) > 1 else f"branch {names[0]} reaches"
     )
-    meanings = [f"{status.name.lower()}: {status.sentence}" for status in dict.fromkeys(statuses)]
+    trust = " ".join(f"{status.name.lower()}: {status.sentence}" for status in dict.fromkeys(statuses))
+    if len(set(statuses)) == 1:
+        trust = f"{_TRUST.get(statuses[0], 'no')}: {uncapitalised(statuses[0].sentence)}"
     verdict = Verdict(
         f"{found} the pose." if reached else "the pose is not reached.",
-        " ".join(meanings),
+        trust,
         "command the corrected values, not the nominal ones." if reached else "",
         "Solution",
     )

@@ -288,11 +288,8 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
     options: dict[str, Any] = dict(files)
     options |= {key: form[key].strip() for key in _EXPORT_OPTIONS if form.get(key, "").strip()}
     exported = export_from_cell(cell, name, ExportRequest(cell.folder, out, **options))
-    contents = kind.contents
-    what = exported.summary or f"{contents[0].upper()}{contents[1:]}"
-    verdict = Verdict(
-        f"{what} written to {out.name}{exported.details}.", "", "test every program at low speed.", "File"
-    )
+    written = f"{exported.summary or kind.title} written to {out.name}{exported.details}."
+    verdict = Verdict(written, "", "test every program at low speed.", "File")
     left: Any = exported.facts.get("left_alone", [])
     alone, changed = (
         [(str(one["line"]), str(one["reason"])) for one in left],

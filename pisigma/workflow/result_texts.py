@@ -99,10 +99,8 @@ def _curve_lines(planned: Plan) -> list[str]:
             f"More than {planned.poses} poses are needed to keep 95 % of the errors below {limit:g} mm."
         )
     elif limit is not None:
-        needed = (
-            f"with {planned.poses_needed} poses" if planned.poses_needed else "already, without more poses"
-        )
-        lines.append(f"95 % of the errors are expected to be below {limit:g} mm {needed}.")
+        needed = f"With {planned.poses_needed}" if planned.poses_needed else "Without more"
+        lines.append(f"{needed} poses, 95 % of the errors are expected to be below {limit:g} mm.")
     return lines
 
 

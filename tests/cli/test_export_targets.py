@@ -166,7 +166,7 @@ def test_a_pose_that_cannot_be_reached(run, refuses, models, poses, tmp_path):
     path, table, program = poses([good[0], FAR, good[1]]), tmp_path / "t.csv", tmp_path / "t.src"
     result = export(run, models / "ur10", path, table)
     assert result.exit_code == 2
-    assert "2 reached, 1 unreachable" in result.stdout
+    assert "2 reached, 1 unreachable" in " ".join(result.stdout.split())
     assert f"{path}, line 4: unreachable" in result.stderr
     rows = list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
     assert [row["status"] for row in rows] == ["reached", "unreachable", "reached"]
@@ -193,7 +193,7 @@ def test_a_pose_outside_the_domain(run, models, poses, tmp_path):
         out = tmp_path / f"cell{suffix}"
         result = export(run, models / "ur10", path, out)
         assert result.exit_code == 0
-        assert "1 reached, 1 outside_domain" in result.stdout
+        assert "1 reached, 1 outside_domain" in " ".join(result.stdout.split())
         assert "line 4: outside_domain" in result.stderr
         text = out.read_text()
         assert ("4,outside_domain," if suffix == ".csv" else "line 4 OUTSIDE DOMAIN") in text

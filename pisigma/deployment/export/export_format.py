@@ -1,5 +1,6 @@
 """Export formats, requests and results."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -148,6 +149,12 @@ class ExportFormat:
     options: frozenset[str] = field(default_factory=frozenset)
     check: Callable[[ExportRequest], None] = lambda request: None
     contains: Contents = "description"
+
+    @property
+    def title(self) -> str:
+        """The contents of a file as the beginning of a sentence, without an article, for example "DH table"."""
+        text = re.sub("^(an?|the) ", "", self.contents)
+        return f"{text[0].upper()}{text[1:]}"
 
     def contents_for(self, request: ExportRequest) -> Contents:
         """Return the contents of the requested file; targets of programs may be poses instead of joint values."""
