@@ -37,19 +37,23 @@ class RowVerdict:
 
     Attributes:
         diagnostics: the findings; those that make the rows implausible come first.
-        judged: the rows with the predictions of the model; None if rows were compared with a nominal robot, or if
-            too few have positions.
-        length_faults: setup faults that explain the errors of rows without positions.
+        rows_under_model: the rows with the predictions of the model; None if rows were compared with a nominal robot,
+            or if too few have positions.
+        faults_of_length_rows: setup faults that explain the errors of rows without positions.
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
-    judged: RowsUnderModel | None = None
-    length_faults: tuple[SetupFault, ...] = ()
+    rows_under_model: RowsUnderModel | None = None
+    faults_of_length_rows: tuple[SetupFault, ...] = ()
 
     @property
     def setup_faults(self) -> tuple[SetupFault, ...]:
         """Setup faults of any size that explain the errors of all rows, including allowed motions."""
-        return self.length_faults if self.judged is None else self.judged.setup_faults
+        return (
+            self.faults_of_length_rows
+            if self.rows_under_model is None
+            else self.rows_under_model.setup_faults
+        )
 
     @property
     def implausible_findings(self) -> tuple[Diagnostic, ...]:

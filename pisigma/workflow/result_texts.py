@@ -238,7 +238,7 @@ def report_text(result: Report, closing_sentences: Sequence[str] = ()) -> Result
         trust = f"no: {result.diagnostics[0].sentence}"
     elif doubt := report_doubt(result):
         trust = f"no: {uncapitalised(doubt)}"
-    elif not content.verdict.held_out:
+    elif not content.verdict.is_held_out:
         trust = "with caution: no held-out rows were judged."
     first, *others = content.advice or ("read the page.",)
     blocks = [sentence_block("further advice", (f"- {one}" for one in others), "  ")]

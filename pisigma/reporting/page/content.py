@@ -57,15 +57,15 @@ class Verdict:
         worst_place: sentence on the place of the largest errors.
         limiting_cause: sentence on the cause that limits the accuracy: the first diagnosed cause, otherwise scatter or
             model.
-        held_out: whether the sentence refers to rows that were not used to make the model.
-        joint: the worst joint of a network, if no pose was evaluated.
+        is_held_out: whether the sentence refers to rows that were not used to make the model.
+        worst_joint: the worst joint of a network, if no pose was evaluated.
     """
 
     sentence: str
     worst_place: str
     limiting_cause: str
-    held_out: bool
-    joint: JudgedJoint | None = None
+    is_held_out: bool
+    worst_joint: JudgedJoint | None = None
 
 
 def verdict_of(
@@ -94,7 +94,7 @@ def verdict_of(
     if best.unit == "mm" and not causes:
         clauses.append(f"what limits it is {say('limit_clause', limit)[0]}")
     sentence = causes[0] if causes else say("limit", limit)[0]
-    return Verdict(f"{'; '.join(clauses)}.", worst, sentence, best.held_out)
+    return Verdict(f"{'; '.join(clauses)}.", worst, sentence, best.is_held_out)
 
 
 def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnostic]) -> tuple[str, ...]:
@@ -113,11 +113,11 @@ def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> V
     """Return the verdict from joint errors if no pose was evaluated."""
     if not joints:
         advice = "Give a file with measurements that the model was not calibrated with."
-        return Verdict(say("no_figures", model)[0], "", advice, held_out=False)
-    of_kind = [one for one in joints if one.held_out == joints[0].held_out]
+        return Verdict(say("no_figures", model)[0], "", advice, is_held_out=False)
+    of_kind = [one for one in joints if one.is_held_out == joints[0].is_held_out]
     worst = max(of_kind, key=lambda one: one.errors.after.values[0])
     advice = "Give a file with measured positions or poses to judge them."
-    return Verdict(say("how_accurate_joint", model, worst)[0], "", advice, worst.held_out, worst)
+    return Verdict(say("how_accurate_joint", model, worst)[0], "", advice, worst.is_held_out, worst)
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
@@ -140,7 +140,7 @@ def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
         f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
         for axis, low, high in zip("xyz", region.low, region.high, strict=True)
     )
-    clause, sentence = say("worst_region", region, where, largest.unit, rows.row_origin)
+    clause, sentence = say("worst_region", region, where, largest.unit, rows.row_role)
     return clause, f"{sentence} {row}"
 
 
@@ -202,10 +202,10 @@ class ReportContent:
         values = {
             "model": self.model.name,
             "verdict": self.verdict.sentence,
-            "held_out": self.verdict.held_out,
+            "held_out": self.verdict.is_held_out,
             "worst": self.verdict.worst_place,
             "limit": {
-                "noise_rms_mm": self.limit.scatter,
+                "noise_rms_mm": self.limit.scatter_mm,
                 "share": self.limit.scatter_share,
                 "summary": self.verdict.limiting_cause if self.accuracies else say("limit", self.limit)[0],
             },
@@ -213,7 +213,7 @@ class ReportContent:
                 {
                     "title": TITLES[one.origin],
                     "summary": rows_text(one),
-                    "held_out": one.held_out,
+                    "held_out": one.is_held_out,
                     "rows": one.rows,
                     "models": {name: figures.figures_by_name for name, figures in one.models.items()},
                 }
@@ -221,12 +221,12 @@ class ReportContent:
             ],
             "rows": None
             if rows is None
-            else {"count": rows.measurements.rows, "origin": rows.row_origin, "remarks": list(self.remarks)},
+            else {"count": rows.measurements.rows, "origin": rows.row_role, "remarks": list(self.remarks)},
             "residuals": [
                 {"variable": one.title, "summary": dependence_text(one)} for one in self.dependences
             ],
-            "frames": [asdict(one) for one in self.frames.name_errors],
-            "targets": [asdict(one) for one in self.targets.name_errors],
+            "frames": self.frames.to_json(),
+            "targets": self.targets.to_json(),
             "not_identified": list(self.unidentified_parameters),
             "observability": {} if self.summary is None else asdict(self.summary.observability),
             "correlated": [list(pair) for pair in self.correlations.pairs],

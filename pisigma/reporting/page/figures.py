@@ -61,7 +61,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
     points = (content.summary.learning_curve if content.summary else None) or ()
     return ReportFigures(
         map=draw_map(
-            "error_map", "map", "Errors over the workspace", content.map.position, content.map.layers[:3]
+            "error_map", "map", "Errors over the workspace", content.map.position_mm, content.map.layers[:3]
         ),
         dependences=tuple(map(draw_dependence, content.dependences)),
         correlations=draw_correlations(content.correlations.tables),

@@ -100,7 +100,7 @@ def script_json(value: Any) -> Markup:
 def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     """Pack the data of the viewer; arrays as base64 of little-endian float32."""
     return {
-        "place": _packed(error_map.position),
+        "place": _packed(error_map.position_mm),
         "layers": [
             {
                 "key": layer.key,
@@ -112,9 +112,9 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
             for layer in error_map.layers
         ],
         "row": _packed(error_map.row),
-        "numberings": list(dict.fromkeys(error_map.numbering)),
-        "numbering": _packed(numbers_of_names(error_map.numbering)),
-        "q": _packed(error_map.q),
+        "numberings": list(dict.fromkeys(error_map.row_numbering)),
+        "numbering": _packed(numbers_of_names(error_map.row_numbering)),
+        "q": _packed(error_map.controller_values),
         "joints": [
             {"name": axis.name, "unit": "°" if axis.type == "revolute" else "mm"} for axis in robot.axes
         ],

@@ -76,7 +76,7 @@ def map_text(error_map: ErrorMap) -> str:
 
 def layer_text(layer: Layer, error_map: ErrorMap) -> str:
     """Return a text on the values of a layer of an error map."""
-    return say("layer", layer.key, error_map.row_origin)[0]
+    return say("layer", layer.key, error_map.row_role)[0]
 
 
 def curve_text(curve: CorrectionCurve) -> str:
@@ -88,8 +88,8 @@ def zeros_table(arm: ArmInImages) -> Table:
     """Return a table of the zeros of the joints."""
     rows = [
         (one.joint, "", "", "not found: base and tool have the same effect")
-        if one.standard_error is None
-        else (one.joint, f"{one.zero_shift:+.2f}", f"{one.standard_error:.2f}", "found")
+        if one.standard_error_deg is None
+        else (one.joint, f"{one.zero_shift_deg:+.2f}", f"{one.standard_error_deg:.2f}", "found")
         for one in arm.zeros
     ]
     return Table(("joint", "error of the zero [deg]", "std. error [deg]", "remark"), tuple(rows))
@@ -139,7 +139,7 @@ def advice_for(
         limit: contribution of measurement scatter to the error.
         causes: diagnosed causes of the errors with their remedies; these sentences come first.
     """
-    held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
+    held_out = [accuracy for accuracy in accuracies if accuracy.is_held_out]
     of_rows = (
         *say("other_rows", model, held_out),
         *say("joint_gaps", partly_measured_joints(model, rows), model),
@@ -221,4 +221,4 @@ def _conditions(rows: JudgedRows | None) -> list[str]:
 
 def _are_stored(rows: JudgedRows) -> bool:
     """Return whether the rows are those that a model folder stores, which does not store their conditions."""
-    return rows.row_origin == "held_out" and rows.measurements.position is None
+    return rows.row_role == "held_out" and rows.measurements.position is None

@@ -52,7 +52,7 @@ class CalibrationValidation:
             "geometric", and "hybrid" if requested, which selects its features using only the training rows.
         spread: position errors with their predicted standard deviations under the hybrid; None without a hybrid.
         distances: errors of held-out stated distances between sockets.
-        frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
+        frames_held_out: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely; their errors are relative to the mean
             predicted position of the ball.
         rows_not_judged: number of held-out rows that could not be evaluated, because no training row has their target
@@ -64,7 +64,7 @@ class CalibrationValidation:
     errors_by_model: Mapping[str, PoseErrors]
     spread: ErrorsWithPredictedSigma | None = None
     distances: DistanceErrors = field(default_factory=DistanceErrors)
-    frames_fitted: int = 0
+    frames_held_out: int = 0
     sockets_held_out: int = 0
     rows_not_judged: int = 0
     further_repeats: tuple["CalibrationValidation", ...] = ()
@@ -109,7 +109,7 @@ class CalibrationValidation:
             figures |= self.predicted_spread.in_file_units()
         if (distances := distance_figures([one.distances for one in self.repeats])) is not None:
             figures["socket_distance"] = distances.model_dump(exclude_unset=True)
-        counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
+        counts = {"frames_fitted": self.frames_held_out, "sockets_held_out": self.sockets_held_out}
         counts["rows_not_judged"] = max(repeat.rows_not_judged for repeat in self.repeats)
         figures |= {name: count for name, count in counts.items() if count}
         if simulations:
@@ -131,7 +131,7 @@ class JudgedFold:
         errors_by_model: their errors by model.
         distances: errors of stated distances between sockets that its calibration did not use.
         spread: position errors and their predicted standard deviations under the hybrid.
-        frames_fitted: number of frames that were held out completely.
+        frames_held_out: number of frames that were held out completely.
         sockets_held_out: number of sockets that were held out completely.
         rows_not_judged: number of held-out rows that could not be evaluated.
     """
@@ -140,7 +140,7 @@ class JudgedFold:
     errors_by_model: Mapping[str, PoseErrors]
     distances: DistanceErrors
     spread: ErrorsWithPredictedSigma | None
-    frames_fitted: int = 0
+    frames_held_out: int = 0
     sockets_held_out: int = 0
     rows_not_judged: int = 0
 
@@ -160,7 +160,7 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
     distances = DistanceErrors.concatenate([fold.distances for fold in judged])
     frames, sockets, not_judged = (
         sum(getattr(fold, count) for fold in judged)
-        for count in ("frames_fitted", "sockets_held_out", "rows_not_judged")
+        for count in ("frames_held_out", "sockets_held_out", "rows_not_judged")
     )
     return CalibrationValidation(folds, errors, spread, distances, frames, sockets, not_judged)
 
@@ -270,7 +270,7 @@ def _judged_fold(
     return replace(
         judged,
         test_rows=judged_rows,
-        frames_fitted=len(set(held_out.frame) - set(training.frame)),
+        frames_held_out=len(set(held_out.frame) - set(training.frame)),
         sockets_held_out=len(_sockets(held_out) - _sockets(training)),
         rows_not_judged=len(test) - len(judged_rows),
     )

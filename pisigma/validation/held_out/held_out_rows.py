@@ -38,7 +38,7 @@ class HeldOutRows:
             never held out, and if it is not stored.
         data_sha256: hash of the measurements.
         line: line of every row in its file; 0 for rows that were not read from a file, or if it is not stored.
-        origin: name of the file of every row if they come from several files; otherwise empty.
+        file_name: name of the file of every row if they come from several files; otherwise empty.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -48,7 +48,7 @@ class HeldOutRows:
     residual: Float64[Tensor, "rows 3"]
     data_sha256: str
     line: tuple[int, ...] = ()
-    origin: tuple[str, ...] = ()
+    file_name: tuple[str, ...] = ()
 
     @staticmethod
     def from_validation(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
@@ -86,7 +86,7 @@ class HeldOutRows:
                 f"{value:.10g}" for value in (self.q[:, j] * factor).tolist()
             ]
         columns |= {"frame": list(self.frame), "target": list(self.target)}
-        columns |= {"file": list(self.origin)} if self.origin else {}
+        columns |= {"file": list(self.file_name)} if self.file_name else {}
         columns |= {"line": list(map(str, self.line))} if any(self.line) else {}
         for name, errors in self.errors_by_model.items():
             columns[f"{name}_mm"] = _cells(errors.position * 1e3)

@@ -37,35 +37,35 @@ class JudgedRows:
     """Rows and their errors, in SI units.
 
     Attributes:
-        row_origin: "held_out": errors under calibrations without the row; "training": errors of training rows of the
+        row_role: "held_out": errors under calibrations without the row; "training": errors of training rows of the
             model; "other": errors of other rows.
         measurements: the rows; only joint values and names for held-out rows that a model stores.
         position: position of the tool in the robot's base frame [m].
         errors_by_model: errors of every row by model, "nominal" first and the model last.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
-        residual_origin: origin of the residuals, in the form of `row_origin`.
+        residual_row_role: role of the rows of the residuals, in the form of `row_role`.
         predicted_sigma: standard deviation of the predicted position [m]; NaN if there is none.
         is_inside_range: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.
         repeated_row_warnings: warnings about duplicate rows and training rows of the model.
-        nominal_frame_origin: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model
+        nominal_frame_source: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model
             that was not calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
-        rows_without_error: number of rows without a position error.
+        rows_without_position_error: number of rows without a position error.
         repeats: number of repeats of the cross-validation; the errors are those of the first one.
     """
 
-    row_origin: str
+    row_role: str
     measurements: Measurements
     position: Float64[Tensor, "rows 3"]
     errors_by_model: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
-    residual_origin: str
+    residual_row_role: str
     predicted_sigma: Float64[Tensor, " rows"]
     is_inside_range: Bool[Tensor, " rows"]
     left_out: int = 0
     repeated_row_warnings: tuple[str, ...] = ()
-    nominal_frame_origin: Literal["fitted", "given", "model"] | None = None
-    rows_without_error: int = 0
+    nominal_frame_source: Literal["fitted", "given", "model"] | None = None
+    rows_without_position_error: int = 0
     repeats: int = 1
 
     @property
@@ -79,7 +79,7 @@ class JudgedRows:
         return list(self.errors_by_model.values())[-1]
 
     @property
-    def scatter(self) -> float | None:
+    def scatter_mm(self) -> float | None:
         """Pooled scatter of positions at equal joint values, as RMS length [mm]; None if there are too few repeats."""
         finite = torch.isfinite(self.residual).all(-1)
         if int(finite.sum()) <= _MIN_REPEATS:
@@ -140,8 +140,8 @@ def judged_rows_of_file(
         _judged(model, rows, models, residual, (origin, origin)),
         left_out=left_out,
         repeated_row_warnings=(*copy_warnings(rows.left_out), *again),
-        nominal_frame_origin="model" if not own_frames else "given" if model.calibrated is None else "fitted",
-        rows_without_error=int((~torch.isfinite(errors.position)).sum()),
+        nominal_frame_source="model" if not own_frames else "given" if model.calibrated is None else "fitted",
+        rows_without_position_error=int((~torch.isfinite(errors.position)).sum()),
     )
 
 
@@ -157,7 +157,7 @@ def judged_rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> Judg
         target=held_out.target,
         line=held_out.line,
         source=model.provenance.data_source,
-        origin=held_out.origin,
+        origin=held_out.file_name,
         payload=payload,
         temperature=temperature,
     )
@@ -199,14 +199,14 @@ def _judged(
     origins: tuple[str, str],
 ) -> JudgedRows:
     return JudgedRows(
-        row_origin=origins[0],
+        row_role=origins[0],
         measurements=replace(
             rows, source=rows.file_names, origin=tuple(Path(name).name for name in rows.origin)
         ),
         position=tool_positions(model, rows.q),
         errors_by_model=models,
         residual=residual,
-        residual_origin=origins[1],
+        residual_row_role=origins[1],
         predicted_sigma=predicted_position_sigma(model, rows),
         is_inside_range=is_inside_range(model, rows.q),
     )

@@ -1,6 +1,10 @@
 """Error statistics of held-out rows as typed values, in millimetres and degrees."""
 
-from pisigma.files.yaml_file import Section
+from typing import Annotated
+
+from pydantic import Field
+
+from pisigma.files.yaml_file import Section, StoredFigures
 
 MODELS = ("nominal", "geometric", "hybrid")
 """Calibrations that are compared, in the order of the tables."""
@@ -61,7 +65,7 @@ class SocketDistances(Section):
         return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
 
 
-class AbstractValidationFigures(Section):
+class AbstractValidationFigures(StoredFigures):
     """Errors of held-out rows under several calibrations.
 
     Attributes:
@@ -74,7 +78,7 @@ class AbstractValidationFigures(Section):
         coverage: share of the held-out coordinates within the 95 % intervals that the hybrid predicts.
         predicted_rms_mm: RMS of the position errors that the hybrid predicts [mm].
         socket_distance: errors of stated distances between sockets that were held out.
-        frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
+        frames_held_out: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely.
         rows_not_judged: number of held-out rows that could not be evaluated, because no training row has their target
             or anchor.
@@ -89,7 +93,7 @@ class AbstractValidationFigures(Section):
     coverage: float | None = None
     predicted_rms_mm: float | None = None
     socket_distance: SocketDistances | None = None
-    frames_fitted: int | None = None
+    frames_held_out: Annotated[int | None, Field(alias="frames_fitted")] = None
     sockets_held_out: int | None = None
     rows_not_judged: int | None = None
 

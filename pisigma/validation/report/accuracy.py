@@ -47,7 +47,7 @@ class Accuracy:
     validation: ValidationFigures | None = None
 
     @property
-    def held_out(self) -> bool:
+    def is_held_out(self) -> bool:
         """Whether the models were made without the rows."""
         return self.origin != "training"
 
@@ -61,7 +61,7 @@ class Accuracy:
         """Error figures of the model of the report."""
         return list(self.models.values())[-1]
 
-    def figure(self, statistic: str, model: str = "") -> float:
+    def leading_statistic(self, statistic: str, model: str = "") -> float:
         """Return a statistic of the leading quantity [`unit`].
 
         Args:
@@ -73,9 +73,9 @@ class Accuracy:
     @property
     def improvement_factor(self) -> float | None:
         """Ratio of the RMS errors of the nominal robot and of the model; None without a nominal robot."""
-        if "nominal" not in self.models or len(self.models) < 2 or not self.figure("rms") > 0:
+        if "nominal" not in self.models or len(self.models) < 2 or not self.leading_statistic("rms") > 0:
             return None
-        return self.figure("rms", "nominal") / self.figure("rms")
+        return self.leading_statistic("rms", "nominal") / self.leading_statistic("rms")
 
 
 def accuracies(
@@ -87,10 +87,10 @@ def accuracies(
     calibrated.
     """
     kept = _of_distilled(model) if model.kind == "distilled" else _of_metrics(model, summary)
-    if rows is None or rows.row_origin == "held_out":
+    if rows is None or rows.row_role == "held_out":
         return tuple(kept)
     of_rows = _of_rows(rows)
-    return (of_rows, *kept) if of_rows.held_out else (*kept, of_rows)
+    return (of_rows, *kept) if of_rows.is_held_out else (*kept, of_rows)
 
 
 def figures_of(errors: PoseErrors) -> ErrorFigures:
@@ -104,7 +104,7 @@ def figures_of(errors: PoseErrors) -> ErrorFigures:
 
 def _of_rows(rows: JudgedRows) -> Accuracy:
     models = {name: figures_of(errors) for name, errors in rows.errors_by_model.items()}
-    origin: RowOrigin = "training" if rows.row_origin == "training" else "file"
+    origin: RowOrigin = "training" if rows.row_role == "training" else "file"
     return Accuracy(origin, rows.measurements.rows, models, rows.measurements.source)
 
 
@@ -144,12 +144,12 @@ class JudgedJoint:
 
     Attributes:
         name: name of the joint.
-        held_out: whether the network was trained without the rows.
+        is_held_out: whether the network was trained without the rows.
         errors: mean, standard deviation and maximum of the absolute errors before and after the correction.
     """
 
     name: str
-    held_out: bool
+    is_held_out: bool
     errors: BeforeAfter
 
     @property
@@ -171,19 +171,19 @@ class ScatterContribution:
     """Contribution of measurement scatter to the error.
 
     Attributes:
-        scatter: RMS length of the scatter of a measured position [mm]; None if unknown.
-        source: source of `scatter`: "repeats" of joint values in the rows, or the "hybrid" calibration.
-        rms_error: RMS length of the position error [mm]; 0 if no position was judged.
-        residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
+        scatter_mm: RMS length of the scatter of a measured position [mm]; None if unknown.
+        scatter_source: source of `scatter_mm`: "repeats" of joint values in the rows, or the "hybrid" calibration.
+        rms_error_mm: RMS length of the position error [mm]; 0 if no position was judged.
+        residual_sigma_mm: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
             without one.
         is_approximation: whether the model approximates another model, whose errors add to its errors.
         limitations: limitations that such a model states, one sentence each.
     """
 
-    scatter: float | None = None
-    source: Literal["repeats", "hybrid", ""] = ""
-    rms_error: float = 0.0
-    residual_sigma: float | None = None
+    scatter_mm: float | None = None
+    scatter_source: Literal["repeats", "hybrid", ""] = ""
+    rms_error_mm: float = 0.0
+    residual_sigma_mm: float | None = None
     is_approximation: bool = False
     limitations: tuple[str, ...] = ()
 
@@ -192,8 +192,8 @@ class ScatterContribution:
         """Share of the squared error that is scatter; None if it is unknown or the scatter exceeds the error."""
         return (
             None
-            if self.scatter is None or self.scatter >= self.rms_error
-            else (self.scatter / self.rms_error) ** 2
+            if self.scatter_mm is None or self.scatter_mm >= self.rms_error_mm
+            else (self.scatter_mm / self.rms_error_mm) ** 2
         )
 
     @property
@@ -213,18 +213,18 @@ def scatter_contribution(
         return ScatterContribution(
             is_approximation=True, limitations=tuple(model.metrics.get("limitations", ()))
         )
-    scatter = None if rows is None else rows.scatter
+    scatter = None if rows is None else rows.scatter_mm
     identified = identified_noise_sigma_mm(summary)
     noise = scatter if scatter is not None or identified is None else math.sqrt(3) * identified
     source: Literal["repeats", "hybrid"] = "hybrid" if scatter is None else "repeats"
-    error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
+    error = accuracy.leading_statistic("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
     sensors = () if summary is None else summary.noise
     # the noise of a corner is not the scatter of a position
     sigma = next(
         (one.sigma_mm for one in sensors if one.sigma_mm is not None and one.sensor != "corner"), None
     )
     if noise is None or not error > 0:
-        return ScatterContribution(rms_error=error, residual_sigma=sigma)
+        return ScatterContribution(rms_error_mm=error, residual_sigma_mm=sigma)
     return ScatterContribution(noise, source, error, sigma)
 
 

@@ -71,13 +71,13 @@ class JointZero:
 
     Attributes:
         joint: name of the joint.
-        zero_shift: calibrated minus nominal zero, in the direction of the joint [deg].
-        standard_error: its standard error [deg]; None if the rows do not determine it.
+        zero_shift_deg: calibrated minus nominal zero, in the direction of the joint [deg].
+        standard_error_deg: its standard error [deg]; None if the rows do not determine it.
     """
 
     joint: str
-    zero_shift: float
-    standard_error: float | None
+    zero_shift_deg: float
+    standard_error_deg: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,11 @@ class ArmInImages:
                 for one in self.images
             ],
             "zeros": [
-                {"joint": one.joint, "error_deg": one.zero_shift, "standard_error_deg": one.standard_error}
+                {
+                    "joint": one.joint,
+                    "error_deg": one.zero_shift_deg,
+                    "standard_error_deg": one.standard_error_deg,
+                }
                 for one in self.zeros
             ],
         }

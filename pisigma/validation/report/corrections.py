@@ -232,14 +232,14 @@ class OutsideErrors:
     Attributes:
         rows_outside: number of rows beyond the calibrated joint values.
         rows: number of all rows.
-        rms_outside: RMS position error of these rows [mm]; None if unknown.
-        rms_inside: RMS position error of the other rows [mm]; None if unknown.
+        rms_outside_mm: RMS position error of these rows [mm]; None if unknown.
+        rms_inside_mm: RMS position error of the other rows [mm]; None if unknown.
     """
 
     rows_outside: int
     rows: int
-    rms_outside: float | None
-    rms_inside: float | None
+    rms_outside_mm: float | None
+    rms_inside_mm: float | None
 
 
 def partly_measured_joints(
@@ -252,7 +252,7 @@ def partly_measured_joints(
         rows: evaluated rows, whose joint values are used unless they belong to another file; None for the joint values
             that the model stores.
     """
-    q = model.starts if rows is None or rows.row_origin == "other" else rows.measurements.q
+    q = model.starts if rows is None or rows.row_role == "other" else rows.measurements.q
     if not len(q):
         return ()
     gaps = []

@@ -38,14 +38,14 @@ class BinTest:
 
     Attributes:
         p_value: probability of such differences by chance.
-        low: smallest RMS error of a bin.
-        high: largest RMS error of a bin, in the unit of the errors.
+        smallest_bin_rms: smallest RMS error of a bin.
+        largest_bin_rms: largest RMS error of a bin, in the unit of the errors.
         worst_bin_edges: values that bound the bin with the largest RMS error, in their unit.
     """
 
     p_value: float
-    low: float
-    high: float
+    smallest_bin_rms: float
+    largest_bin_rms: float
     worst_bin_edges: tuple[float, float]
 
     @property
@@ -56,7 +56,7 @@ class BinTest:
     @property
     def is_notable(self) -> bool:
         """Whether the RMS errors of bins differ by `NOTABLE_RATIO` or more."""
-        return self.high >= NOTABLE_RATIO * self.low
+        return self.largest_bin_rms >= NOTABLE_RATIO * self.smallest_bin_rms
 
 
 @dataclass(frozen=True)
@@ -119,16 +119,16 @@ class FrameOrTargetErrors:
     Attributes:
         name: frame or target.
         rows: number of rows.
-        before: RMS error of the nominal robot [mm or deg].
-        after: RMS error of the model [mm or deg].
-        bias: mean signed error in the row's frame [mm]; None if no signed error is known.
+        nominal_rms: RMS error of the nominal robot [mm or deg].
+        model_rms: RMS error of the model [mm or deg].
+        bias_mm: mean signed error in the row's frame [mm]; None if no signed error is known.
     """
 
     name: str
     rows: int
-    before: float
-    after: float
-    bias: tuple[float, float, float] | None
+    nominal_rms: float
+    model_rms: float
+    bias_mm: tuple[float, float, float] | None
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,20 @@ class ErrorsByFrameOrTarget:
     @property
     def largest(self) -> FrameOrTargetErrors | None:
         """Frame or target with the largest RMS error under the model; None if there are no rows."""
-        return max((one for one in self.name_errors if one.rows), key=lambda one: one.after, default=None)
+        return max((one for one in self.name_errors if one.rows), key=lambda one: one.model_rms, default=None)
+
+    def to_json(self) -> list[dict[str, object]]:
+        """Return the errors of every frame or target as plain values."""
+        return [
+            {
+                "name": one.name,
+                "rows": one.rows,
+                "before": one.nominal_rms,
+                "after": one.model_rms,
+                "bias": one.bias_mm,
+            }
+            for one in self.name_errors
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +279,7 @@ def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndar
     significant, tenth = chance < SIGNIFICANT, max(len(number) // 10, 1)
     change = float(values[-tenth:].mean() - values[:tenth].mean()) if significant else 0.0
     joint, joint_r = _ordered_joint(rows) if significant else (None, 0.0)
-    test = OrderTest(name, r, chance, change, joint, joint_r, signed and rows.residual_origin == "training")
+    test = OrderTest(name, r, chance, change, joint, joint_r, signed and rows.residual_row_role == "training")
     shown: dict[str, np.ndarray] = (
         {str(one): those for one, those in components.items()} if signed else errors
     )

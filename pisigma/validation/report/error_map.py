@@ -58,31 +58,31 @@ class ErrorMap:
     """Points in the robot's base frame, with quantities at every point.
 
     Attributes:
-        position: position of the tool in the robot's base frame [mm].
+        position_mm: position of the tool in the robot's base frame [mm].
         layers: quantities that can be shown, at least one.
         row: line of every point's row in the file, or else the number of the row from 1; 0 for samples.
-        numbering: what `row` counts at every point: "line", "b.csv, line" if the rows are of several files, or "row".
-        q: the controller's values of the axes [deg or mm].
+        row_numbering: what `row` counts at every point: "line", "b.csv, line" for rows of several files, or "row".
+        controller_values: the controller's values of the axes [deg or mm].
         frame: frame of every point.
         target: target of every point.
         is_inside_range: whether every joint value was measured for the calibration.
         rows: number of evaluated rows; 0 for samples of the workspace.
         source: file of the rows, or name of the model.
-        row_origin: `JudgedRows.row_origin` of the rows; "" for samples of the workspace.
+        row_role: `JudgedRows.row_role` of the rows; "" for samples of the workspace.
         random_points: number of points that were drawn at random.
     """
 
-    position: Float64[np.ndarray, "points 3"]
+    position_mm: Float64[np.ndarray, "points 3"]
     layers: tuple[Layer, ...]
     row: Int64[np.ndarray, " points"]
-    numbering: tuple[str, ...]
-    q: Float64[np.ndarray, "points axes"]
+    row_numbering: tuple[str, ...]
+    controller_values: Float64[np.ndarray, "points axes"]
     frame: tuple[str, ...]
     target: tuple[str, ...]
     is_inside_range: Bool[np.ndarray, " points"]
     rows: int
     source: str
-    row_origin: str
+    row_role: str
     random_points: int
 
 
@@ -101,7 +101,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
     number = torch.tensor([line or k + 1 for k, line in enumerate(rows.measurements.line)])
     points = rows.measurements.select(chosen)
     shown = [replace(layer, values=layer.values[chosen.numpy()]) for layer in layers]
-    return _map(model, points, shown, number[chosen], (count, rows.measurements.source, rows.row_origin, 0))
+    return _map(model, points, shown, number[chosen], (count, rows.measurements.source, rows.row_role, 0))
 
 
 def map_of_workspace(model: CalibratedModel) -> ErrorMap:

@@ -39,9 +39,9 @@ def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
     arm, model = hybrid
     rows = measured(arm, 150, seed=9)
     content = report_content(model, tmp_path, rows)
-    assert content.rows.row_origin == "other"
+    assert content.rows.row_role == "other"
     first = content.accuracies[0]
-    assert (first.origin, first.held_out, first.rows) == ("file", True, 150)
+    assert (first.origin, first.is_held_out, first.rows) == ("file", True, 150)
     assert list(first.models) == ["nominal", "geometric", "hybrid"]
     error = np.linalg.norm((rows.position - poses_of_rows(model, rows)[:, :3, 3]).numpy(), axis=1) * 1e3
     for name, value in (
@@ -59,17 +59,17 @@ def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
         rtol=0,
         atol=0,
     )
-    assert content.verdict.held_out
+    assert content.verdict.is_held_out
     assert first.models["nominal"].rms_mm > 2 * first.models["hybrid"].rms_mm
 
 
 def test_rows_of_the_calibration_are_recognised_by_their_hash(hybrid, tmp_path):
     arm, model = hybrid
     content = report_content(model, tmp_path, arm.measurements)
-    assert content.rows.row_origin == "training"
+    assert content.rows.row_role == "training"
     own = content.accuracies[-1]
     assert own.origin == "training"
-    assert not own.held_out
+    assert not own.is_held_out
     assert content.accuracies[0].origin == "cross_validation"  # the held-out figures of the model come first
     assert content.accuracies[0].models == CalibrationSummary.read(model).cross_validation.models
 
@@ -78,7 +78,7 @@ def test_training_rows_are_not_held_out_rows(hybrid, tmp_path):
     arm, model = hybrid
     bare = replace(model, metrics={})
     content = report_content(bare, tmp_path, arm.measurements)
-    assert not content.verdict.held_out
+    assert not content.verdict.is_held_out
     assert [(one.origin, one.rows) for one in content.accuracies] == [("training", 200)]
 
 
@@ -86,7 +86,7 @@ def test_joint_values_measured_again_are_reported(hybrid, tmp_path):
     arm, model = hybrid
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
-    assert content.rows.row_origin == "other"
+    assert content.rows.row_role == "other"
     assert any("200 of 200" in line for line in content.rows.repeated_row_warnings)
     assert set(content.rows.repeated_row_warnings) < set(content.remarks)
 
@@ -97,11 +97,11 @@ def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
     training = report_content(model, tmp_path, arm.measurements).rows
     for rows in (arm.measurements, None):
         content = report_content(kept, tmp_path / "arm", rows)
-        assert content.rows.row_origin == "held_out"
+        assert content.rows.row_role == "held_out"
         assert_close(content.rows.model_errors.position, 1.1 * training.model_errors.position, rtol=6e-5)
         assert content.correlations.tables
     other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
-    assert other.rows.row_origin == "other"
+    assert other.rows.row_role == "other"
 
 
 def test_a_model_in_another_frame_is_worse_than_nominal(hybrid, tmp_path):
@@ -129,10 +129,10 @@ def test_errors_per_frame_and_target(tmp_path):
     assert sum(one.rows for one in names) == 200
     error = content.rows.residual.norm(dim=-1).numpy() * 1e3
     wall = np.array([name == "wall" for name in arm.measurements.frame])
-    assert_close(names[0].after, np.sqrt((error[wall] ** 2).mean()), rtol=1e-12)
-    assert_close(names[0].bias, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9, atol=1e-12)
+    assert_close(names[0].model_rms, np.sqrt((error[wall] ** 2).mean()), rtol=1e-12)
+    assert_close(names[0].bias_mm, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9, atol=1e-12)
     assert 0 < content.frames.p_value <= 1
-    assert content.frames.largest.after == max(one.after for one in names)
+    assert content.frames.largest.model_rms == max(one.model_rms for one in names)
     assert len(content.targets.name_errors) == 2
 
 
@@ -145,7 +145,7 @@ def test_rows_in_sockets_are_compared_with_the_mean_of_the_socket(hybrid, tmp_pa
     expected = torch.cat([ball[:4].mean(0) - ball[:4], ball[4:8].mean(0) - ball[4:8]])
     assert_close(content.rows.residual[:8], expected, atol=1e-12)
     assert bool(torch.isnan(content.rows.residual[8]).all())
-    assert content.rows.rows_without_error == 1
+    assert content.rows.rows_without_position_error == 1
     assert any("1 of 9 rows" in line for line in content.remarks)
 
 
@@ -160,7 +160,7 @@ def test_the_workspace_is_shown_without_rows(hybrid, tmp_path):
     content = report_content(hybrid[1], tmp_path)
     assert content.rows is None
     assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
-    assert len(content.map.position) == 3000
+    assert len(content.map.position_mm) == 3000
     assert (content.map.rows, content.map.random_points) == (0, 3000 - len(hybrid[1].starts))
     assert content.missing_figures
     assert content.dependences == ()
@@ -172,7 +172,7 @@ def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
     assert list(content.accuracies[0].models) == ["nominal", "geometric"]
     assert content.curves == ()
     assert len(content.missing_figures) == 1  # no predicted accuracy
-    assert (content.limit.scatter, content.limit.scatter_share) == (None, None)
+    assert (content.limit.scatter_mm, content.limit.scatter_share) == (None, None)
     assert content.summary == CalibrationSummary.read(model)
 
 
@@ -181,7 +181,7 @@ def test_a_model_of_a_network_only_is_reported(name, tmp_path):
     model = hand_made_model(name)
     alone = report_content(model, tmp_path)
     assert alone.accuracies == ()
-    assert not alone.verdict.held_out
+    assert not alone.verdict.is_held_out
     assert alone.summary is None
     q = joints_around(name, 50, seed=4)
     T = model.forward(q)
@@ -208,11 +208,11 @@ def test_repeated_rows_show_the_scatter(hybrid, tmp_path):
     position = arm.true.forward(q)[:, :3, 3] + torch.from_numpy(rng.normal(0, 1e-4, (240, 3)))
     content = report_content(model, tmp_path, Measurements(q=q, position=position))
     limit = content.limit
-    assert limit.source == "repeats"
+    assert limit.scatter_source == "repeats"
     values = content.rows.residual.numpy().reshape(4, 60, 3)
     pooled = ((values - values.mean(0)) ** 2).sum() / (240 - 60)
-    assert_close(limit.scatter, math.sqrt(pooled) * 1e3, rtol=1e-12)
-    assert_close(limit.scatter, math.sqrt(3) * 0.1, rtol=0.1)
+    assert_close(limit.scatter_mm, math.sqrt(pooled) * 1e3, rtol=1e-12)
+    assert_close(limit.scatter_mm, math.sqrt(3) * 0.1, rtol=0.1)
 
 
 def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
@@ -220,11 +220,11 @@ def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
     limit = scatter_contribution(model, CalibrationSummary.read(model), accuracy, None)
-    assert_close(limit.scatter, math.sqrt(3) * sigma, rtol=1e-12)
-    larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.scatter)})
+    assert_close(limit.scatter_mm, math.sqrt(3) * sigma, rtol=1e-12)
+    larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.scatter_mm)})
     limit = scatter_contribution(model, CalibrationSummary.read(model), larger, None)
     assert_close(limit.scatter_share, 0.25, rtol=1e-12)
-    assert (limit.source, limit.is_mostly_scatter) == ("hybrid", False)
+    assert (limit.scatter_source, limit.is_mostly_scatter) == ("hybrid", False)
 
 
 def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
@@ -232,9 +232,9 @@ def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
     accuracy = report_content(model, tmp_path).accuracies[0]
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
     limit = scatter_contribution(model, CalibrationSummary.read(model), smaller, None)
-    assert limit.scatter > 1e-3
+    assert limit.scatter_mm > 1e-3
     assert limit.scatter_share is None
-    assert limit.rms_error == 1e-3
+    assert limit.rms_error_mm == 1e-3
 
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):

@@ -117,7 +117,7 @@ def test_the_map_contains_the_stated_content(hostile_page):
     content, text = hostile_page
     data = json.loads(Page(text).scripts[1])
     unpack = lambda packed: np.frombuffer(base64.b64decode(packed), "<f4")  # noqa: E731
-    assert_close(unpack(data["place"]).reshape(-1, 3), content.map.position, rtol=1e-6, atol=1e-3)
+    assert_close(unpack(data["place"]).reshape(-1, 3), content.map.position_mm, rtol=1e-6, atol=1e-3)
     for stored, layer in zip(data["layers"], content.map.layers, strict=True):
         assert_close(unpack(stored["values"]), layer.values, rtol=1e-6)
     named = [data["frames"][int(k)] for k in unpack(data["frame"])]
@@ -152,7 +152,7 @@ def test_every_section_is_on_the_page(tmp_path):
 def test_a_page_of_many_rows_is_small(tmp_path):
     arm, model = geometric_under_test()
     content = report_content(model, tmp_path, measured(arm, 4_000, seed=9))
-    assert len(content.map.position) == 4_000
+    assert len(content.map.position_mm) == 4_000
     assert len(page_of(content).encode()) < 6e6
 
 

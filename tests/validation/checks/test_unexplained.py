@@ -69,7 +69,7 @@ def test_errors_of_zeros_count_in_the_direction_of_the_joint(monkeypatch):
     monkeypatch.setattr(CalibrationSummary, "read", lambda _: summary)
     with no_type_checker():
         assert next(check_joint_zero(found)).values["change_deg"] == pytest.approx(-2.0)
-        assert [one.zero_shift for one in arm_in_images._zeros(SimpleNamespace(robot=robot))] == [-2.0]
+        assert [one.zero_shift_deg for one in arm_in_images._zeros(SimpleNamespace(robot=robot))] == [-2.0]
 
 
 @pytest.mark.parametrize(("degrees", "joints"), [(0.0, []), (1.0, [2]), (-1.0, [2])])

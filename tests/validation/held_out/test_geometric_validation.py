@@ -41,7 +41,7 @@ def exact(**options: object) -> GeometricCalibrator:
 def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     data = socket_data()
     found = validate(exact(socket_distances=KNOWN), data, k_folds(data, None, 0, "placement"))
-    assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 6, 0)
+    assert (found.folds, found.sockets_held_out, found.frames_held_out) == (3, 6, 0)
     assert_close(
         found.errors_by_model["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8
     )
@@ -144,7 +144,7 @@ def test_frames_of_exact_touches_are_met_where_they_were_held_out() -> None:
     data = touch_data(("right", "left", "back"))
     frames = {name: tuple(base + 0.01) for name, base in TRUE_BASES.items()}
     found = validate(exact(base_guesses=frames), data, k_folds(data, None, 0, "placement"))
-    assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 0, 3)
+    assert (found.folds, found.sockets_held_out, found.frames_held_out) == (3, 0, 3)
     assert_close(
         found.errors_by_model["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8
     )

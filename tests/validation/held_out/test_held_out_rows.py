@@ -94,7 +94,7 @@ def test_rows_of_a_report_are_named_by_file_and_line(measured, tmp_path):
     rows = judged_rows_of_folder(model, read_held_out(tmp_path, model))
     shown = map_of_rows(model, rows)
     assert shown.row.tolist() == list(line)
-    assert shown.numbering == ("first.csv, line", "second.csv, line") * (ROWS // 2)
+    assert shown.row_numbering == ("first.csv, line", "second.csv, line") * (ROWS // 2)
     worst = largest_errors(rows).row
     assert rows.measurements.place_of(worst) == RowPlace(origin[worst][3:], line[worst])
 
@@ -107,7 +107,7 @@ def test_joint_values_of_a_report_are_those_of_the_controller(tmp_path):
     rows = judged_rows_of_folder(model, read_held_out(tmp_path, model))
     assert_close(rows.measurements.q, q, rtol=1e-9)
     shown = np.rad2deg(model.robot.to_controller(q.numpy()))
-    assert_close(map_of_rows(model, rows).q, shown, atol=1e-7)
+    assert_close(map_of_rows(model, rows).controller_values, shown, atol=1e-7)
     third = dependences(rows, model.robot)[2]
     assert_close(third.values, shown[:-1, 2], atol=1e-7)  # the last row has no error
     assert "q3_dh_deg" in text.splitlines()[0].split(",")

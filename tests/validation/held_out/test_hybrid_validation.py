@@ -151,7 +151,7 @@ def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
     named = replace(rows, frame=tuple("left" if k < 160 else "right" for k in range(ROWS)))
     part = torch.arange(160), torch.arange(160, ROWS)
     found = validate(small(arm.true.nominal), named, [part])
-    assert found.frames_fitted == 1
+    assert found.frames_held_out == 1
     rms = {name: errors.rms_mm for name, errors in found.figures().models.items()}
     assert rms["hybrid"] < 0.7 * rms["geometric"]
     assert found.spread.value_count == 0  # nothing is predicted of where a frame is that was not seen
