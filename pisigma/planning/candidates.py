@@ -43,7 +43,7 @@ class Candidates:
         number: number of every candidate in the file, or among the drawn poses, from 1.
         considered: number of poses that were drawn or read.
         refused: number of refused poses by reason.
-        workspace: joint values at which the robot must be accurate, and which may be waypoints [rad or m]. These are
+        workspace_q: joint values at which the robot must be accurate, and which may be waypoints [rad or m]. These are
             the candidates or, with a camera, which sees its board only from a small part of the workspace, poses that
             the surroundings allow.
     """
@@ -52,7 +52,7 @@ class Candidates:
     number: Int64[Tensor, " candidates"]
     considered: int
     refused: Counter[str]
-    workspace: Float64[Tensor, "poses dof"]
+    workspace_q: Float64[Tensor, "poses dof"]
 
     @property
     def sentence(self) -> str:
@@ -145,7 +145,7 @@ def with_workspace(
         values, (lower, upper) = arm.robot.to_controller(near), arm.limits.t()
         return torch.where(((values >= lower) & (values <= upper)).all(1, keepdim=True), near, q)
 
-    return replace(candidates, q=unwrapped(candidates.q), workspace=unwrapped(workspace_candidates.q))
+    return replace(candidates, q=unwrapped(candidates.q), workspace_q=unwrapped(workspace_candidates.q))
 
 
 def read_candidates(

@@ -177,7 +177,8 @@ class CameraProspects:
         rms_with_more_images: RMS error with `_MORE_IMAGES` more images [m].
         rms_with_exact_corners: RMS error with corners without noise [m].
         rms_with_exact_robot: RMS error with a robot that repeats exactly [m].
-        free_displacement: largest distance of the board from its stated place at which it does not leave an image [m].
+        allowed_board_displacement: largest distance of the board from its stated place at which it does not leave an
+            image [m].
         unidentifiable: parameters of the arm that images cannot identify, one sentence each.
     """
 
@@ -185,7 +186,7 @@ class CameraProspects:
     rms_with_more_images: float
     rms_with_exact_corners: float
     rms_with_exact_robot: float
-    free_displacement: float
+    allowed_board_displacement: float
     unidentifiable: tuple[str, ...]
 
     @staticmethod
@@ -236,7 +237,7 @@ class CameraProspects:
             else rms_of(after.tool_derivatives(task)),
             rms(posterior_with(_EXACT_CORNERS, sight.repeatability)),
             rms(posterior_with(sight.corner_noise, _EXACT_ROBOT)),
-            float(views.margin_in_image(arm, q).min()),
+            float(views.placement_margin(arm, q).min()),
             _unidentifiable(arm, sight.is_fixed),
         )
 
@@ -244,7 +245,11 @@ class CameraProspects:
         """Return the figures as plain values."""
         names = ("more_images", "exact_corners", "exact_robot")
         figures = {f"{name}_rms_mm": getattr(self, f"rms_with_{name}") * 1e3 for name in names}
-        return {**figures, "room_mm": self.free_displacement * 1e3, "sentences": list(self.sentences)}
+        return {
+            **figures,
+            "room_mm": self.allowed_board_displacement * 1e3,
+            "sentences": list(self.sentences),
+        }
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -262,8 +267,8 @@ class CameraProspects:
             *self.unidentifiable,
             "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only "
             "a known distance reveals.",
-            f"The board leaves the first image if it or the camera is {self.free_displacement * 1e3:.0f} mm from its "
-            "place in the surroundings; a larger margin_px allows more.",
+            f"The board leaves the first image if it or the camera is {self.allowed_board_displacement * 1e3:.0f} mm "
+            "from its place in the surroundings; a larger margin_px allows more.",
         )
 
 

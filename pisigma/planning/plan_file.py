@@ -35,11 +35,11 @@ class Waypoint(Section):
     """Joint values through which the robot moves to a pose.
 
     Attributes:
-        before: number of the pose, in the order of the plan.
+        before_pose: number of the pose, in the order of the plan; `before` in the file.
         joints: joint values [deg, or mm for prismatic joints].
     """
 
-    before: int = Field(ge=1)
+    before_pose: int = Field(ge=1, alias="before")
     joints: tuple[BoundedFloat, ...]
 
 
@@ -72,8 +72,8 @@ class StoredPlan:
         settings: settings of the plan, with paths relative to the working directory.
         model: folder of the planned model; None for a nominal robot.
         q: joint values [rad or m].
-        check: whether each pose tests the calibration (set "test") or is used for it ("train").
-        candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.
+        is_test_pose: whether each pose tests the calibration (set "test") or is used for it ("train").
+        candidate_number: row of each pose in the file of candidates, or its number among the random poses; from 1.
         waypoints: joint values through which the robot moves to each pose [rad or m]; usually none.
         number: number of each pose, which is kept in parts of the plan; () if numbers start at 1.
     """
@@ -82,8 +82,8 @@ class StoredPlan:
     settings: PlanSettings
     model: Path | None
     q: Float64[Tensor, "poses dof"]
-    check: Bool[Tensor, " poses"]
-    candidate: Int64[Tensor, " poses"]
+    is_test_pose: Bool[Tensor, " poses"]
+    candidate_number: Int64[Tensor, " poses"]
     waypoints: tuple[Float64[Tensor, "_points dof"], ...]
     number: tuple[int, ...] = ()
 
@@ -97,8 +97,8 @@ class StoredPlan:
         return replace(
             self,
             q=self.q[poses],
-            check=self.check[poses],
-            candidate=self.candidate[poses],
+            is_test_pose=self.is_test_pose[poses],
+            candidate_number=self.candidate_number[poses],
             waypoints=tuple(self.waypoints[pose] for pose in poses.tolist()),
             number=tuple(self.numbers[pose] for pose in poses.tolist()),
         )
@@ -112,8 +112,8 @@ class StoredPlan:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([*joint_columns(self.arm.robot), "set", *PLAN_COLUMNS])
-        sets = ["test" if check else "train" for check in self.check.tolist()]
-        rows = zip(self._in_file_units(self.q), sets, self.candidate.tolist(), strict=True)
+        sets = ["test" if check else "train" for check in self.is_test_pose.tolist()]
+        rows = zip(self._in_file_units(self.q), sets, self.candidate_number.tolist(), strict=True)
         for order, (joints, name, candidate) in zip(self.numbers, rows, strict=True):
             writer.writerow([*joints, name, order, candidate])
         write_atomically(path, text.getvalue())
@@ -187,7 +187,7 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
         tuple(
             arm.robot.to_dh(
                 torch.tensor(
-                    [point.joints for point in document.way_points if point.before == number],
+                    [point.joints for point in document.way_points if point.before_pose == number],
                     dtype=torch.float64,
                 ).reshape(-1, len(axes))
                 * scale

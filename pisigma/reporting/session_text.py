@@ -21,7 +21,7 @@ def session_text(state: SessionState, closing_sentences: Sequence[str] = ()) -> 
         state: state of the session.
         closing_sentences: sentence on the written files.
     """
-    counting = int((~state.rows.alarmed).sum())
+    counting = int((~state.rows.is_unused).sum())
     reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
     alarmed = len(state.rows.line) - counting
     trust = (
@@ -66,10 +66,10 @@ def step_lines(step: SessionStep) -> Iterator[str]:
         yield f"Waiting: {step.growth.missing_part}"
     state = step.state
     lines = [] if step.growth.rows is None else step.growth.rows.line
-    alarms = {alarm.line for alarm in step.alarms if not alarm.counts}
+    alarms = {alarm.line for alarm in step.alarms if not alarm.row_is_used}
     yield from _row_lines(state, [line for line in lines if line not in alarms])
     yield from merge_alike_warnings(
-        f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}" for alarm in step.alarms
+        f"{'Remark' if alarm.row_is_used else 'ALARM'}: {alarm.sentence}" for alarm in step.alarms
     )
     for point in step.points:
         yield f"Accuracy {accuracy_text(point)}"
@@ -98,7 +98,7 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
 def row_text(state: SessionState, row: int) -> str:
     """Return a text with the distance of a row from its prediction by the other rows."""
     error = float((state.rows.error[row] ** 2).sum() ** 0.5)
-    kind = " (check)" if state.rows.check[row] else ""
+    kind = " (check)" if state.rows.is_test_row[row] else ""
     if error != error:
         return f"cannot be judged yet{kind}"
     return f"{error * 1e3:.2f} mm from what the other rows predict{kind}"
@@ -112,8 +112,8 @@ def next_pose_text(state: SessionState) -> str:
     units = ("deg" if turns else "mm" for turns in state.revolute)
     values = zip(state.in_file_units(following.controller_values), units, strict=True)
     joints = ", ".join(f"{value:.3f} {unit}" for value, unit in values)
-    kind = " (check)" if following.check else ""
-    return f"Next: pose {following.number} of {following.count}{kind}: {joints}."
+    kind = " (check)" if following.is_test_pose else ""
+    return f"Next: pose {following.number} of {following.largest_pose_number}{kind}: {joints}."
 
 
 def session_page(step: SessionStep | None, state: SessionState, title: str) -> "RenderableType":
@@ -149,7 +149,7 @@ def session_page(step: SessionStep | None, state: SessionState, title: str) -> "
 
 
 def _verdict(state: SessionState, row: int) -> str:
-    return "not used" if state.rows.alarmed[row] else row_text(state, row)
+    return "not used" if state.rows.is_unused[row] else row_text(state, row)
 
 
 def _points(points: Sequence[AccuracyPoint]) -> list[tuple[str, ...]]:

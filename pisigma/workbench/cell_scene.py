@@ -220,7 +220,7 @@ class CellScene:
         """Draw the rows with the magnification of the slider; return the position of the first marked row."""
         if self._scene is None or self._rows is None:
             return None
-        rows = replace(self._rows, alarmed=self._rows.alarmed | np.isin(self._rows.line, self._marked))
+        rows = replace(self._rows, is_unused=self._rows.is_unused | np.isin(self._rows.line, self._marked))
         position = self._scene.show_rows(rows, color_scale_maximum(rows), float(self._slider.value))
         marked = np.flatnonzero(np.isin(rows.line, self._marked))
         return position[marked[0]] if marked.size else None

@@ -79,10 +79,10 @@ class MeasuringSession:
         candidates = find_candidates(plan.settings, plan.arm)
         subject = RobotOrModel(plan.arm.nominal) if plan.model is None else RobotOrModel.load(plan.model)
         self._against = subject.model or plan.arm.robot
-        self._task = task_joint_values(plan.arm, plan.settings, candidates.workspace, subject.model)
+        self._task = task_joint_values(plan.arm, plan.settings, candidates.workspace_q, subject.model)
         self._further = FurtherPoses.from_plan(plan, candidates, self._task)
         self._before = subject.posterior(plan.arm, replace(plan.settings, measured=None))
-        self._planned, self._planned_check = plan.q, plan.check
+        self._planned, self._planned_check = plan.q, plan.is_test_pose
         self._numbers = list(plan.numbers)
         self._judged = SessionRows(plan.arm.robot, self._before.instrument.sigma)
         self._setup, self._setup_alarms, self._looked_at = "", list[Alarm](), 0
@@ -92,7 +92,7 @@ class MeasuringSession:
         self._so_far: SessionAccuracy | None = None
         self._ahead_of: SessionAccuracy | None = None
         self._validated: SessionAccuracy | None = None
-        self._poses = int((~plan.check).sum())
+        self._poses = int((~plan.is_test_pose).sum())
 
     @staticmethod
     def read(
@@ -223,7 +223,7 @@ class MeasuringSession:
             if again is not None:
                 self._adopt(again)
             remaining = self._open
-            poses = self.plan.q[remaining[~self.plan.check[remaining]]]
+            poses = self.plan.q[remaining[~self.plan.is_test_pose[remaining]]]
         ahead = self._compute(
             partial(
                 expected_accuracy,
@@ -296,7 +296,7 @@ class MeasuringSession:
         )
 
     def _next_pose(self, first: int) -> NextPose:
-        q, check = self.plan.q[first].numpy(), bool(self.plan.check[first])
+        q, check = self.plan.q[first].numpy(), bool(self.plan.is_test_pose[first])
         number = self.plan.numbers[first]
         return NextPose(number, max(self._numbers), q, check, self.plan.arm.robot.to_controller(q))
 
@@ -329,7 +329,7 @@ class MeasuringSession:
         numbers = [number or next(further) for number in numbers]
         self.plan, self.replanned = replace(plan, number=tuple(numbers)), True
         self._planned = torch.cat([self._planned, plan.q])
-        self._planned_check = torch.cat([self._planned_check, plan.check])
+        self._planned_check = torch.cat([self._planned_check, plan.is_test_pose])
         self._numbers += numbers
 
     @property

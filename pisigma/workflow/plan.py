@@ -83,12 +83,12 @@ class Plan:
     @property
     def poses(self) -> int:
         """Number of poses to calibrate with."""
-        return int((~self.stored_plan.check).sum())
+        return int((~self.stored_plan.is_test_pose).sum())
 
     @property
     def check_poses(self) -> int:
         """Number of poses to test the calibration with."""
-        return int(self.stored_plan.check.sum())
+        return int(self.stored_plan.is_test_pose.sum())
 
     @property
     def main_error_sources(self) -> tuple[str, ...]:
@@ -197,7 +197,7 @@ def plan(
     progress("prior knowledge")
     repeated = check_measured(subject.model, settings, arm.robot)
     posterior = subject.posterior(arm, settings)
-    task = task_joint_values(arm, settings, candidates.workspace, subject.model)
+    task = task_joint_values(arm, settings, candidates.workspace_q, subject.model)
     problem = _Problem(subject, settings, arm, candidates, posterior, task)
     chosen, stored, way, usable = problem.choose(progress)
     progress("expected accuracy")
@@ -212,7 +212,7 @@ def plan(
         (
             *repeated,
             *_warnings(way, len(candidates.q) - len(usable), candidates),
-            *arm.unseparated_links,
+            *arm.unchecked_link_sentences,
             *problem.unexcited_joints,
             *problem.view_warnings(chosen),
         ),
@@ -270,7 +270,7 @@ class _Problem:
         most informative poses come first, in stages, so that the measurement may end early.
         """
         q, count = self.candidates.q, self.settings.count
-        free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
+        free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace_q)
         kept, kept_check = free[:0], free[:0]
         for earlier_rounds in range(_MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
@@ -287,7 +287,7 @@ class _Problem:
             way = plan_tour(motions, q[poses], self.settings.pace, stages=stage_ends(len(poses)))
             free = _without(free, poses[way.left_out])
             if len(way.left_out) and not earlier_rounds:
-                most = free[motions.reach_most(q[free], self.task)]
+                most = free[motions.reach_most_of_task(q[free], self.task)]
                 free = most if len(most) >= len(poses) else free
             kept, kept_check = (some[torch.isin(some, free)] for some in (chosen, check))
             if not len(way.left_out) or len(free) < len(poses):

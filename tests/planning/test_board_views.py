@@ -52,12 +52,12 @@ def test_views_cover_all_angles_distances_and_branches(settings: PlanSettings, d
     solver = closed_form_solver(arm.robot)
     assert solver is not None
     assert len(nearest_branch(solver, drawn.q).unique()) >= 6
-    assert 0 < float(views.margin_in_image(arm, drawn.q).min()) < 0.05
+    assert 0 < float(views.placement_margin(arm, drawn.q).min()) < 0.05
 
 
 def test_the_workspace_is_not_that_of_the_views(drawn: Candidates):
-    assert len(drawn.workspace) == 1000
-    assert float(drawn.workspace[:, 0].max() - drawn.workspace[:, 0].min()) > 5
+    assert len(drawn.workspace_q) == 1000
+    assert float(drawn.workspace_q[:, 0].max() - drawn.workspace_q[:, 0].min()) > 5
 
 
 def test_a_board_from_behind_is_refused(settings: PlanSettings, drawn: Candidates):

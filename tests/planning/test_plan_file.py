@@ -46,8 +46,8 @@ def test_a_plan_is_the_same_after_writing_and_reading(stored: StoredPlan, tmp_pa
     assert read.model == stored.model
     assert_close(read.arm.robot.dh, ARM.robot.dh, atol=1e-12)
     assert_close(read.q, stored.q, atol=1e-8)
-    assert read.check.tolist() == [False, True, False, False]
-    assert read.candidate.tolist() == stored.candidate.tolist()
+    assert read.is_test_pose.tolist() == [False, True, False, False]
+    assert read.candidate_number.tolist() == stored.candidate_number.tolist()
     for points, written in zip(read.waypoints, stored.waypoints, strict=True):
         assert_close(points, written, atol=1e-8)
 

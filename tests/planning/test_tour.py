@@ -98,7 +98,7 @@ def test_the_part_of_the_free_space_with_the_task_is_found():
     few_behind = torch.cat([q[front], q[~front][:20]])
     motions = Motions(arm, few_behind)
     for part in (front, ~front):
-        reached = motions.reach_most(q, q[part])
+        reached = motions.reach_most_of_task(q, q[part])
         assert not bool(reached[~part].any())
         assert float(reached[part].double().mean()) > 0.95
 

@@ -55,7 +55,7 @@ def session_state(arm: ArmInSurroundings, rows: int, wrong: int | None = None) -
     alarms = tuple(
         Alarm(row + 2, "off", f"line {row + 2}: {said}", True) for row in np.flatnonzero(alarmed).tolist()
     )
-    more = NextPose(rows + 1, POSES, plan[rows], check=rows % 6 == 5) if rows < POSES else None
+    more = NextPose(rows + 1, POSES, plan[rows], is_test_pose=rows % 6 == 5) if rows < POSES else None
     measure = Advice("measure", "Measure the next pose: the limit of 0.15 mm is not reached yet.")
     return SessionState(
         rows=RowsSoFar(tuple(range(2, rows + 2)), q, position, error, np.arange(rows) % 6 == 5, alarmed),

@@ -63,7 +63,7 @@ def test_limiting_factors_and_unidentifiable_parameters_are_reported(planned: Pl
     assert_close(camera.rms, planned.accuracy_curve[-1].rms, rtol=1e-9)
     for better in (camera.rms_with_more_images, camera.rms_with_exact_corners, camera.rms_with_exact_robot):
         assert 0 < better < camera.rms
-    assert 0 < camera.free_displacement < 0.1
+    assert 0 < camera.allowed_board_displacement < 0.1
     text = " ".join(camera.unidentifiable)
     assert "theta_6, d_6, a_6 and alpha_6" in text
     assert "theta_1 and d_1" in text

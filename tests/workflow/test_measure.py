@@ -38,7 +38,7 @@ def session():
 def test_before_anything_is_measured():
     state = MeasuringSession(PLAN.stored).state
     assert state.next_pose is not None
-    assert (state.next_pose.number, state.next_pose.count) == (1, 24)
+    assert (state.next_pose.number, state.next_pose.largest_pose_number) == (1, 24)
     assert (len(state.remaining), state.accuracy, state.base) == (24, None, None)
     assert state.advice.action == "measure"
     json.dumps(state.to_json(), allow_nan=False)
@@ -64,7 +64,7 @@ def test_remaining_poses_are_replanned_with_the_same_number(session, tmp_path):
     session.write_remaining(tmp_path / "rest.csv")
     rest = read_plan(tmp_path / "rest.csv")
     assert len(rest.q) == 7
-    assert int(rest.check.sum()) == 1
+    assert int(rest.is_test_pose.sum()) == 1
     numbers = dict(zip(rest.numbers, rest.q, strict=True))
     assert len(numbers) == 7
     for (
@@ -120,7 +120,7 @@ def test_rows_are_checked_together_as_one_by_one():
     for row in range(rows.rows):
         single.add(rows.select(torch.tensor([row])))
     assert [alarm.line for alarm in alarms] == [rows.line[14]]
-    assert together.state.rows.alarmed.tolist() == single.state.rows.alarmed.tolist()
+    assert together.state.rows.is_unused.tolist() == single.state.rows.is_unused.tolist()
     torch.testing.assert_close(*(torch.as_tensor(one.state.rows.error) for one in (together, single)))
 
 

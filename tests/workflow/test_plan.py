@@ -198,7 +198,7 @@ def test_all_poses_are_planned_in_the_part_of_the_free_space_that_contains_the_t
     planned = plan("kiro3", settings, CELL.model_validate({"boxes": boxes}))
     q = planned.stored_plan.q
     assert len(q) == 10
-    assert int(planned.stored_plan.check.sum()) == 2
+    assert int(planned.stored_plan.is_test_pose.sum()) == 2
     assert len(q[:, 0].sign().unique()) == 1
     assert task_in_front is None or bool((q[0, 0] > 0) == task_in_front)
     assert len(planned.warnings) >= 1

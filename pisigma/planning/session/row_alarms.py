@@ -40,7 +40,7 @@ def alarm_of_all_rows(sentence: str) -> Alarm:
 def withdrawn_alarm(line: int) -> Alarm:
     """Return the message that withdraws an alarm."""
     text = f"line {line}: later rows agree with it, so the row is used again."
-    return Alarm(line, "cleared", text, repeat=False, counts=True)
+    return Alarm(line, "cleared", text, repeat=False, row_is_used=True)
 
 
 def stale_reading_alarms(rows: Measurements, start: int) -> Iterator[Alarm]:
@@ -92,7 +92,7 @@ def unplanned_joint_alarms(
             text = _in_other_unit(robot, rows.q[row : row + 1], poses, names) or (
                 "its joint values are not those of a planned pose; the row is treated as an additional pose."
             )
-        yield Alarm(rows.line[row], "pose", f"line {rows.line[row]}: {text}", repeat=False, counts=True)
+        yield Alarm(rows.line[row], "pose", f"line {rows.line[row]}: {text}", repeat=False, row_is_used=True)
 
 
 def _in_other_unit(
@@ -130,8 +130,8 @@ def contradiction_alarm(
     assert judgement.model is not None
     assert judgement.errors is not None
     line, errors = rows.line[row], judgement.errors
-    length, angle = float(errors.length[row]), float(errors.angle[row].rad2deg())
-    usual = float(errors.length[judgement.used_rows].nanmedian()) * 1e3
+    length, angle = float(errors.length_error[row]), float(errors.angle_error[row].rad2deg())
+    usual = float(errors.length_error[judgement.used_rows].nanmedian()) * 1e3
     parts = [f"{length * 1e3:.2f} mm"] if length == length else []
     parts += [f"{angle:.3f} deg in orientation"] if angle == angle else []
     what = f"line {line}: the measured value is {' and '.join(parts) or 'far'} from the prediction of the other rows"
@@ -161,7 +161,7 @@ def _other_pose(
     assert judgement.errors is not None
     if rows.position is None or not bool(rows.position[row].isfinite().all()):
         return ""
-    geometry, length = judgement.model.geometry, float(judgement.errors.length[row])
+    geometry, length = judgement.model.geometry, float(judgement.errors.length_error[row])
     q = torch.cat([poses, rows.q])
     at = Measurements(q, frame=(rows.frame[row],) * len(q), target=(rows.target[row],) * len(q))
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, at)

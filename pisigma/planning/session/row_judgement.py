@@ -63,17 +63,18 @@ class LeaveOneOutErrors:
     Attributes:
         p_value: probability that a correct row has an error at least as improbable; NaN for rows that cannot be
             checked.
-        length: size of the error of the measured length [m]; NaN for rows that cannot be checked.
-        angle: size of the error of the measured orientation [rad]; NaN for rows that cannot be checked.
-        position: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be checked.
-        scale: ratio of this robot's errors to the errors of its class, at least 1.
+        length_error: size of the error of the measured length [m]; NaN for rows that cannot be checked.
+        angle_error: size of the error of the measured orientation [rad]; NaN for rows that cannot be checked.
+        position_error: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be
+            checked.
+        error_scale: ratio of this robot's errors to the errors of its class, at least 1.
     """
 
     p_value: Float64[Tensor, " rows"]
-    length: Float64[Tensor, " rows"]
-    angle: Float64[Tensor, " rows"]
-    position: Float64[Tensor, "rows 3"]
-    scale: float
+    length_error: Float64[Tensor, " rows"]
+    angle_error: Float64[Tensor, " rows"]
+    position_error: Float64[Tensor, "rows 3"]
+    error_scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ class RowModel:
         setup: rows, and initial guesses of base and tool.
         design: the unknowns.
         values: values of each sensor, linearised at `point`.
-        weights: columns of the weights of gravity and series, linearised nearby.
+        weight_columns: columns of the weights of gravity and series, linearised nearby.
         point: all parameters.
         sigma: standard deviation of every value [m or rad].
         kept: rows to which base and tool are fitted, and from which others are predicted.
@@ -98,7 +99,7 @@ class RowModel:
     setup: CalibrationSetup
     design: Design
     values: tuple[SensorValues, ...]
-    weights: Float64[Tensor, "values weights"]
+    weight_columns: Float64[Tensor, "values weights"]
     point: Float64[Tensor, " parameters"]
     sigma: Float64[Tensor, " values"]
     kept: Bool[Tensor, " rows"]
@@ -240,7 +241,8 @@ class RowModel:
     @cached_property
     def _columns(self) -> Float64[Tensor, "values unknowns"]:
         return torch.cat(
-            [torch.cat([one.geometry_derivatives.flatten(0, 1) for one in self.values]), self.weights], 1
+            [torch.cat([one.geometry_derivatives.flatten(0, 1) for one in self.values]), self.weight_columns],
+            1,
         )
 
     @cached_property
@@ -376,7 +378,7 @@ def _contradicted(
     counts = model.kept
     chance = torch.where(counts, errors.p_value, torch.nan)
     suspects = [int(chance.nan_to_num(nan=1.0).argmin())] if bool((chance < FALSE_ALARMS).any()) else []
-    if few and (suspects or errors.scale > _CONTRADICTORY_FACTOR):
+    if few and (suspects or errors.error_scale > _CONTRADICTORY_FACTOR):
         suspects = counts.nonzero()[:, 0].tolist()
     fits: dict[int, RowModel] = {}
     for row in suspects if len(suspects) > 1 else ():

@@ -147,7 +147,7 @@ class SessionRows:
             those = [torch.from_numpy(geometry.bases[name]) for name in at.frame]
             bases = transform_from_xyz_zyx(torch.stack(those))
             position[usable] = (invert(bases) @ T)[:, :3, 3]
-            error[usable] = (bases[:, :3, :3].mT @ errors.position[..., None])[..., 0]
+            error[usable] = (bases[:, :3, :3].mT @ errors.position_error[..., None])[..., 0]
         return position.numpy(), error.numpy()
 
 
@@ -205,7 +205,7 @@ class FurtherPoses:
         """Return evenly selected candidates of a plan."""
         count = len(candidates.q)
         some = torch.linspace(0, count - 1, min(count, _MAX_CANDIDATES)).round().long()
-        motions = Motions(plan.arm, candidates.workspace[:_MAX_CANDIDATES])
+        motions = Motions(plan.arm, candidates.workspace_q[:_MAX_CANDIDATES])
         return FurtherPoses(candidates.q[some], candidates.number[some], motions, task)
 
     def replan(
@@ -229,14 +229,14 @@ class FurtherPoses:
             The new plan; None if nothing can be selected.
         """
         first = remaining[:1]
-        check = remaining[1:][plan.check[remaining[1:]]]
-        count = pose_count - accuracy_so_far.point.poses - int((~plan.check[first]).sum())
+        check = remaining[1:][plan.is_test_pose[remaining[1:]]]
+        count = pose_count - accuracy_so_far.point.poses - int((~plan.is_test_pose[first]).sum())
         new = self._new(plan, torch.cat([measured, plan.q[first]]))
         posterior = accuracy_so_far.posterior
         if not len(first) or not 0 < count <= len(new):
             return None
         # The robot is already on its way to the next pose, which counts as measured unless it only tests the model.
-        if not bool(plan.check[first]):
+        if not bool(plan.is_test_pose[first]):
             posterior = posterior.after_measuring(plan.q[first])
         seen, tool = posterior.sensitivities(self.q), posterior.tool_derivatives(self.task)
         for _ in range(_MAX_REPLACEMENTS):
@@ -254,12 +254,12 @@ class FurtherPoses:
             new = new[~torch.isin(new, chosen[shut_in])]
             if not len(shut_in):
                 break
-        number = torch.cat([self.number[chosen], plan.candidate[check]])[use]
+        number = torch.cat([self.number[chosen], plan.candidate_number[check]])[use]
         return replace(
             plan.select_poses(first),
             q=torch.cat([plan.q[first], q[way.order]]),
-            check=torch.cat([plan.check[first], use[way.order] >= count]),
-            candidate=torch.cat([plan.candidate[first], number[way.order]]),
+            is_test_pose=torch.cat([plan.is_test_pose[first], use[way.order] >= count]),
+            candidate_number=torch.cat([plan.candidate_number[first], number[way.order]]),
             waypoints=(plan.waypoints[int(first)], *way.waypoints_before),
             number=(),
         )

@@ -29,14 +29,24 @@ class Alarm:
         kind: kind of the alarm.
         sentence: what was expected, what was measured, and what to do.
         repeat: whether to measure the pose again.
-        counts: whether the row is used despite the alarm.
+        row_is_used: whether the row is used despite the alarm.
     """
 
     line: int
     kind: AlarmKind
     sentence: str
     repeat: bool
-    counts: bool = False
+    row_is_used: bool = False
+
+    def to_json(self) -> dict[str, object]:
+        """Return the alarm as plain values."""
+        return {
+            "line": self.line,
+            "kind": self.kind,
+            "sentence": self.sentence,
+            "repeat": self.repeat,
+            "counts": self.row_is_used,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +58,16 @@ class RowsSoFar:
         q: commanded joint values [rad or m].
         position: predicted position of the target in the robot's base frame [m]; NaN while base and tool are unknown.
         error: measured minus predicted position in the robot's base frame [m]; NaN for rows that cannot be checked.
-        check: mask of the rows of the set "test", which test the calibration and are not used for it.
-        alarmed: mask of the rows that are not used.
+        is_test_row: mask of the rows of the set "test", which test the calibration and are not used for it.
+        is_unused: mask of the rows that are not used.
     """
 
     line: tuple[int, ...]
     q: Float64[np.ndarray, "rows dof"]
     position: Float64[np.ndarray, "rows 3"]
     error: Float64[np.ndarray, "rows 3"]
-    check: Bool[np.ndarray, " rows"]
-    alarmed: Bool[np.ndarray, " rows"]
+    is_test_row: Bool[np.ndarray, " rows"]
+    is_unused: Bool[np.ndarray, " rows"]
 
     @staticmethod
     def unjudged(line: tuple[int, ...], q: Float64[np.ndarray, "rows dof"]) -> "RowsSoFar":
@@ -72,16 +82,16 @@ class NextPose:
 
     Attributes:
         number: number of the pose, which does not change when the remaining poses are replanned.
-        count: largest number of a pose so far.
+        largest_pose_number: largest number of a pose so far.
         q: joint values [rad or m].
-        check: whether the pose tests the calibration.
+        is_test_pose: whether the pose tests the calibration.
         commanded: controller values [rad or m], if they differ from the joint values.
     """
 
     number: int
-    count: int
+    largest_pose_number: int
     q: Float64[np.ndarray, " dof"]
-    check: bool
+    is_test_pose: bool
     commanded: Float64[np.ndarray, " axes"] | None = None
 
     @property
@@ -185,22 +195,22 @@ class SessionState:
 
     def to_json(self) -> dict[str, object]:
         """Return the figures as plain values, the result of `pisigma measure --json`; None for unknown values."""
-        counting = ~self.rows.alarmed
+        counting = ~self.rows.is_unused
         sizes = np.linalg.norm(self.rows.error, axis=1) * 1e3
         following = self.next_pose
         return {
             "rows": len(self.rows.line),
             "rows_counting": int(counting.sum()),
-            "check_rows": int((self.rows.check & counting).sum()),
+            "check_rows": int((self.rows.is_test_row & counting).sum()),
             "errors_mm": [_number(size) for size in sizes.tolist()],
-            "alarms": [asdict(alarm) for alarm in self.alarms],
+            "alarms": [alarm.to_json() for alarm in self.alarms],
             "poses_left": len(self.remaining),
             "next_pose": None
             if following is None
             else {
                 "number": following.number,
-                "count": following.count,
-                "set": "test" if following.check else "train",
+                "count": following.largest_pose_number,
+                "set": "test" if following.is_test_pose else "train",
                 "joints": self.in_file_units(following.controller_values),
                 "units": ["deg" if turns else "mm" for turns in self.revolute],
             },

@@ -106,7 +106,7 @@ class ArmInSurroundings:
         return replace(self, pair_clearance=pair_clearance)
 
     @property
-    def unseparated_links(self) -> tuple[str, ...]:
+    def unchecked_link_sentences(self) -> tuple[str, ...]:
         """Return a sentence about links that are not checked against each other because stated radii are too large.
 
         Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. The

@@ -94,7 +94,7 @@ class Motions:
         lengths[first, second] = lengths[second, first] = _lengths(self.arm, nodes[first], nodes[second])
         return nodes, lengths
 
-    def reach_most(
+    def reach_most_of_task(
         self, poses: Float64[Tensor, "poses dof"], task: Float64[Tensor, "tasks dof"]
     ) -> Bool[Tensor, " poses"]:
         """Return the mask of poses with a free motion to the connected part of the roadmap that most of a task reaches.

@@ -25,12 +25,12 @@ class LostMotion:
 
     Attributes:
         joint_backlash: backlash of the joints by their index [rad or m].
-        error_ratio: ratio of the errors of the rows without and with the backlash in the model [1].
+        error_increase_factor: ratio of the errors of the rows without and with the backlash in the model [1].
         log_bayes_factor: logarithm of the odds of backlash in these joints against none.
     """
 
     joint_backlash: dict[int, float]
-    error_ratio: float
+    error_increase_factor: float
     log_bayes_factor: float
 
 
@@ -51,10 +51,10 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
     if len(rows.residual) < MIN_ROWS:
         return None
     assert measurements.approach is not None
-    rows = rows.with_own_noise
+    rows = rows.with_estimated_noise
     approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.row_index]
     moved = (rows.joint_derivative * approach[:, None]).reshape(-1, approach.shape[1])
-    free = rows.without_parameters(moved)
+    free = rows.project_out_parameters(moved)
     possible = np.flatnonzero((free**2).sum(0) > 1e-12 * (moved**2).sum(0)).tolist()
     best = None
     for count in range(1, len(possible) + 1):
@@ -67,7 +67,7 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
             effect = rows.evidence_of(free[:, joints])
             play = dict(zip(joints, (2 * np.abs(effect.effect_sizes)).tolist(), strict=True))
             choice = math.log(math.comb(len(possible), count))
-            found.append(LostMotion(play, effect.error_ratio, effect.log_bayes_factor - choice))
+            found.append(LostMotion(play, effect.error_increase_factor, effect.log_bayes_factor - choice))
         better = max(found, key=lambda one: one.log_bayes_factor, default=None)
         if better is None or (best is not None and better.log_bayes_factor <= best.log_bayes_factor):
             break
@@ -123,7 +123,12 @@ def unstated_backlash(
         return None  # the calibration itself rejects these rows
     ordered = OrderedRows.from_result(result)
     found = None if ordered is None else find_backlash(ordered, rows)
-    if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.error_ratio < NOTICED:
+    if (
+        ordered is None
+        or found is None
+        or found.log_bayes_factor < LIKELY
+        or found.error_increase_factor < NOTICED
+    ):
         return None
     lag = find_lag(ordered, rows)
     if lag is not None and lag.log_bayes_factor > found.log_bayes_factor:
@@ -150,13 +155,13 @@ def _diagnostic(result: CalibrationResult, rows: Measurements, found: LostMotion
         severity="warning",
         sentence=f"{joints_text(joints).capitalize()}: a backlash of about "
         f"{join_words(f'{size:.2g} {unit}' for size, unit in sizes)}. The errors depend on the direction of "
-        f"the last motion and are {found.error_ratio:.3g} times as large as without this effect. The "
+        f"the last motion and are {found.error_increase_factor:.3g} times as large as without this effect. The "
         "directions were taken from the order of the rows, and errors of held-out rows are errors with known "
         f"directions; without them, commanded poses have further errors of {length_text(error)} RMS. {remedy}",
         cause="unstated",
         values={
             "joints": tuple(joint + 1 for joint in joints),
-            "factor": found.error_ratio,
+            "factor": found.error_increase_factor,
             "log_odds": found.log_bayes_factor,
             "error_mm": error * 1e3,
         }

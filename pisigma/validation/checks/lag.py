@@ -29,13 +29,13 @@ class Lag:
         logged_before_arrival: whether joint values were logged before the arrival, on the way from the previous row;
             otherwise they were logged after departure.
         share_of_motion: lag as a share of the motion between two rows [1].
-        error_ratio: ratio of the errors with and without the lag [1].
+        error_increase_factor: ratio of the errors with and without the lag [1].
         log_bayes_factor: logarithm of the odds of a lag against no lag.
     """
 
     logged_before_arrival: bool
     share_of_motion: float
-    error_ratio: float
+    error_increase_factor: float
     log_bayes_factor: float
 
 
@@ -46,18 +46,22 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     rows = OrderedRows.from_result(checked.geometric)
     lag = None if rows is None else find_lag(rows, checked.rows)
-    if lag is None or lag.log_bayes_factor < LIKELY or lag.error_ratio < NOTICED:
+    if lag is None or lag.log_bayes_factor < LIKELY or lag.error_increase_factor < NOTICED:
         return
     when = "before the robot had arrived" if lag.logged_before_arrival else "after the robot had left"
     motion = "from the previous row" if lag.logged_before_arrival else "to the next row"
     yield Diagnostic(
         kind="lag",
-        severity="implausible" if lag.error_ratio > _LARGE else "warning",
+        severity="implausible" if lag.error_increase_factor > _LARGE else "warning",
         sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
-        f"{abs(lag.share_of_motion):.2g} of the motion {motion} and make the errors {lag.error_ratio:.3g} times as "
-        "large; log them when the robot has stopped.",
+        f"{abs(lag.share_of_motion):.2g} of the motion {motion} and make the errors {lag.error_increase_factor:.3g} "
+        "times as large; log them when the robot has stopped.",
         cause="before_arrival" if lag.logged_before_arrival else "after_departure",
-        values={"share": lag.share_of_motion, "factor": lag.error_ratio, "log_odds": lag.log_bayes_factor},
+        values={
+            "share": lag.share_of_motion,
+            "factor": lag.error_increase_factor,
+            "log_odds": lag.log_bayes_factor,
+        },
         remedy="Log them when the robot has stopped.",
     )
 
@@ -71,13 +75,18 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    rows, found = rows.with_own_noise, []
+    rows, found = rows.with_estimated_noise, []
     for before, motion in zip((True, False), motions_between_rows(measurements), strict=True):
         z = (rows.joint_derivative @ np.nan_to_num(motion[rows.row_index])[..., None]).reshape(-1, 1)
-        free = rows.without_parameters(z)
+        free = rows.project_out_parameters(z)
         if (free**2).sum() > 1e-12 * (z**2).sum():
             effect = rows.evidence_of(free)
             found.append(
-                Lag(before, float(effect.effect_sizes[0]), effect.error_ratio, effect.log_bayes_factor)
+                Lag(
+                    before,
+                    float(effect.effect_sizes[0]),
+                    effect.error_increase_factor,
+                    effect.log_bayes_factor,
+                )
             )
     return max(found, key=lambda lag: lag.log_bayes_factor, default=None)

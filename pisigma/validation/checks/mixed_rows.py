@@ -192,7 +192,7 @@ def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         found = None if ordered is None else find_populations(ordered, checked.rows.rows)
         if found is None or not _differ(found):
             continue
-        if result is learned or learned is None or found.error_ratio > _factor_of_hybrid(checked):
+        if result is learned or learned is None or found.error_increase_factor > _factor_of_hybrid(checked):
             yield _two_populations(checked.rows, found)
             return
     yield from _two_sizes(checked)
@@ -236,7 +236,7 @@ def _differ(found: Populations) -> bool:
     """Return whether the rows are two populations rather than one arm with unmodelled errors."""
     return (
         found.log_bayes_factor > _CERTAIN
-        and found.error_ratio
+        and found.error_increase_factor
         > _LARGE[found.differing_part] * max((1 - _HARDLY_USED) / (1 - found.absorbed_share), 1.0)
         and int(found.in_smaller_population.sum()) >= MIN_SHARE * found.evaluated_rows
     )
@@ -258,17 +258,17 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
             "Name another frame in these rows (column 'frame'), or leave them out",
         ),
     }[found.differing_part]
-    implausible = found.differing_part == "arm" or found.error_ratio > _IMPLAUSIBLE
+    implausible = found.differing_part == "arm" or found.error_increase_factor > _IMPLAUSIBLE
     return Diagnostic(
         kind="two_populations",
         severity="implausible" if implausible else "warning",
         sentence=f"Two populations are mixed: {size} of {found.evaluated_rows} rows {difference} "
-        f"({distinction.clause}); the errors of all rows together are {found.error_ratio:.2g} times as large as "
-        f"separately. {advice}.",
+        f"({distinction.clause}); the errors of all rows together are {found.error_increase_factor:.2g} times as large "
+        f"as separately. {advice}.",
         rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
         cause=found.differing_part,
         values={
-            "factor": found.error_ratio,
+            "factor": found.error_increase_factor,
             "log_odds": found.log_bayes_factor,
             "distinguished_by": distinction.kind,
         },

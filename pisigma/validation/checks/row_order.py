@@ -52,19 +52,20 @@ def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         for motion in motions
         if motion
         and motion.log_bayes_factor > _LIKELY
-        and not (motion.begins_frame and motion.error_ratio <= _LARGE)
+        and not (motion.is_at_frame_start and motion.error_increase_factor <= _LARGE)
     ]
     if likely:
-        motion = max(likely, key=lambda motion: motion.error_ratio)
-        certain = motion.log_bayes_factor > _CERTAIN and motion.error_ratio > _LARGE
+        motion = max(likely, key=lambda motion: motion.error_increase_factor)
+        certain = motion.log_bayes_factor > _CERTAIN and motion.error_increase_factor > _LARGE
         what, remedy = _texts(motion, checked.rows)
         yield Diagnostic(
             kind="row_order",
             severity="implausible" if certain else "warning",
-            sentence=f"{what}; this makes the errors of the rows {motion.error_ratio:.3g} times as large. {remedy}",
+            sentence=f"{what}; this makes the errors of the rows {motion.error_increase_factor:.3g} times as large. "
+            f"{remedy}",
             rows=()
-            if motion.first_row is None
-            else (checked.rows.place(int(motion.rows[motion.first_row])),),
+            if motion.first_moved_index is None
+            else (checked.rows.place(int(motion.row_indices[motion.first_moved_index])),),
             cause=motion.kind,
             values=_values(motion, checked.rows),
             remedy=remedy,
@@ -76,11 +77,11 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
         "name": motion.name,
         "shift_mm": math.hypot(*motion.shift) * 1e3,
         "turn_deg": math.degrees(motion.turn),
-        "factor": motion.error_ratio,
+        "factor": motion.error_increase_factor,
         "log_odds": motion.log_bayes_factor,
     }
-    if motion.first_row is not None:
-        row = int(motion.rows[motion.first_row])
+    if motion.first_moved_index is not None:
+        row = int(motion.row_indices[motion.first_moved_index])
         values |= {"first_row": row, "first_line": rows.line[row]}
     return values
 
@@ -93,13 +94,13 @@ def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
     amount = f"{length_text(math.hypot(*motion.shift))} (x {x:.3g}, y {y:.3g}, z {z:.3g} mm "
     amount += "in its axes)" if motion.kind == "frame" else "in the flange's axes)"
     amount += f" and {math.degrees(motion.turn):.2g} deg" if motion.turn > 0 else ""
-    if motion.first_row is None:
+    if motion.first_moved_index is None:
         return (
             f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}",
             "Let the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at "
             "several lines (--set new_frame_at=LINE).",
         )
-    row = int(motion.rows[motion.first_row])
+    row = int(motion.row_indices[motion.first_moved_index])
     naming = "name another target in them (column 'target')"
     if motion.kind == "frame":
         naming = f"give them another frame (--set new_frame_at={rows.line[row] or 'LINE'})"

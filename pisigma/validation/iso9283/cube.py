@@ -44,7 +44,9 @@ class IsoCube:
         lower = torch.cat([around, -torch.ones(4, 1, dtype=torch.float64)], 1)
         return self.centre + self.edge / 2 * torch.cat([upper, lower])
 
-    def poses(self, plane: str = "C1-C2-C7-C8", diagonal_fraction: float = 0.1) -> Float64[Tensor, "5 3"]:
+    def test_positions(
+        self, plane: str = "C1-C2-C7-C8", diagonal_fraction: float = 0.1
+    ) -> Float64[Tensor, "5 3"]:
         """Compute the positions of P1 to P5 [m] (ISO 9283:1998, 6.8).
 
         P1 is the intersection of the diagonals of the plane, the centre of the cube; P2 to P5 are on the diagonals near

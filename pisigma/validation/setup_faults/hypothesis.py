@@ -84,7 +84,7 @@ class PredictingArm:
         """Frames that are fitted to compare hypotheses; without a model, these are always base and tool."""
         return ("base and tool",) if self.model is None else ("none", "base", "base and tool")
 
-    def screened_errors(
+    def mean_squared_errors(
         self,
         rows: Measurements,
         q: Float64[Tensor, "maps rows dof"],

@@ -244,7 +244,7 @@ def is_quarter_turn(angle: float) -> bool:
 def likely_maps(arm: PredictingArm, measurements: Measurements, measured: MeasuredPoses) -> JointMaps:
     """Find maps of joint values that may explain the measured poses, to be tried with the whole model.
 
-    Thousands of maps are tried on a few rows with the geometry alone; see `PredictingArm.screened_errors`.
+    Thousands of maps are tried on a few rows with the geometry alone; see `PredictingArm.mean_squared_errors`.
 
     Args:
         arm: the predicting arm.
@@ -257,7 +257,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     def errors_of(
         maps: JointMaps, modes: Sequence[FittedFrames] = arm.fits_of_frames
     ) -> Float64[Tensor, "modes maps"]:
-        return arm.screened_errors(some, maps.apply(some.q), few, modes)
+        return arm.mean_squared_errors(some, maps.apply(some.q), few, modes)
 
     kinds = (
         joint_unit_maps(robot),

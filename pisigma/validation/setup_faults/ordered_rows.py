@@ -96,7 +96,7 @@ class OrderedRows:
             self.derivative,
             self.jacobian,
             self.noise,
-            self.precision,
+            self.prior_precision,
             *setup,
         ):
             digest.update(b"" if one is None else np.ascontiguousarray(one).tobytes())
@@ -223,7 +223,7 @@ class OrderedRows:
         )
 
     @cached_property
-    def precision(self) -> Float64[np.ndarray, " unknowns"]:
+    def prior_precision(self) -> Float64[np.ndarray, " unknowns"]:
         """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
@@ -241,10 +241,10 @@ class OrderedRows:
     def covariance(self) -> Float64[np.ndarray, "unknowns unknowns"]:
         """Covariance of the parameters and weights, with full weight of all rows."""
         flat = self.jacobian.reshape(-1, self.jacobian.shape[2])
-        return inverse_of(flat.T @ flat + np.diag(self.precision))
+        return inverse_of(flat.T @ flat + np.diag(self.prior_precision))
 
     @cached_property
-    def with_own_noise(self) -> "OrderedRows":
+    def with_estimated_noise(self) -> "OrderedRows":
         """The same rows, divided by the noise that parameters and joint errors leave, for the search of small effects.
 
         The noise of a geometric calibration contains what its parameters do not explain, such as the sag under a load.
@@ -257,7 +257,7 @@ class OrderedRows:
         kinds = 3 + (APPROACH in self.problem.state.conditions)
         rows = replace(self, prior_factors=(1.0,) * kinds)
         weights = [int(used.sum()) for _, used, _ in rows._joint_errors]
-        kind = np.repeat(np.arange(-1, kinds), [len(rows.precision) - sum(weights), *weights])
+        kind = np.repeat(np.arange(-1, kinds), [len(rows.prior_precision) - sum(weights), *weights])
         scale, sizes = _noise_and_sizes(rows, kind)
         scale = np.maximum(scale, ALWAYS_GOOD / self.noise)
         return replace(
@@ -271,9 +271,11 @@ class OrderedRows:
     @cached_property
     def residual_after_fit(self) -> Float64[np.ndarray, "rows values"]:
         """Residuals after fitting the parameters and the series of joint errors."""
-        return self.without_parameters(self.residual.ravel()).reshape(self.residual.shape)
+        return self.project_out_parameters(self.residual.ravel()).reshape(self.residual.shape)
 
-    def without_parameters(self, values: Float64[np.ndarray, "*values"]) -> Float64[np.ndarray, "*values"]:
+    def project_out_parameters(
+        self, values: Float64[np.ndarray, "*values"]
+    ) -> Float64[np.ndarray, "*values"]:
         """Return the remainder of values, or of columns of values, after fitting the parameters and weights to them."""
         X = self.jacobian.reshape(-1, self.jacobian.shape[2])
         left: np.ndarray = values - X @ (self.covariance @ (X.T @ values))
@@ -282,7 +284,7 @@ class OrderedRows:
     @cached_property
     def unexplained_residual(self) -> Float64[np.ndarray, " values"]:
         """Clipped residuals after fitting the parameters and the series of joint errors."""
-        return self.without_parameters(self.clipped_residual.ravel())
+        return self.project_out_parameters(self.clipped_residual.ravel())
 
     def evidence_of(self, columns: Float64[np.ndarray, "values sizes"]) -> "Effect":
         """Fit further columns to the unexplained residuals (Frisch-Waugh).
@@ -290,7 +292,7 @@ class OrderedRows:
         The Bayes factor is that of Schwarz's criterion (1978, Annals of Statistics 6(2)).
 
         Args:
-            columns: derivatives of the values with respect to the sizes, after `without_parameters`.
+            columns: derivatives of the values with respect to the sizes, after `project_out_parameters`.
         """
         left, count = self.unexplained_residual, columns.shape[1]
         sizes = np.linalg.lstsq(columns, left, rcond=None)[0]
@@ -342,7 +344,7 @@ def _noise_and_sizes(
         for values in (rows.jacobian, rows.clipped_residual)
     )
     measured, normal, descent = X.any(2).sum(1), X.swapaxes(1, 2) @ X, (X.swapaxes(1, 2) @ r)[..., 0]
-    variance, sizes, held = np.ones(sensors), np.ones(kind.max() + 1), rows.precision.copy()
+    variance, sizes, held = np.ones(sensors), np.ones(kind.max() + 1), rows.prior_precision.copy()
     for _ in range(_MAX_ITERATIONS):
         before = np.concatenate([variance, sizes])
         covariance = inverse_of((normal / variance[:, None, None]).sum(0) + np.diag(held))
@@ -352,11 +354,11 @@ def _noise_and_sizes(
         variance = np.maximum(left / np.maximum(measured - used, 1.0), 1e-300)
         determined, squares = (
             np.bincount(kind[weights], values[weights], len(sizes))
-            for values in (1 - held * covariance.diagonal(), np.square(x) * rows.precision)
+            for values in (1 - held * covariance.diagonal(), np.square(x) * rows.prior_precision)
         )
         estimated = np.sqrt(squares / np.maximum(determined, _MIN_EFFECTIVE)).clip(_SMALLEST_SIZE)
         sizes = np.where(determined > _MIN_EFFECTIVE, estimated, sizes)
-        held[weights] = rows.precision[weights] / np.square(sizes[kind[weights]])
+        held[weights] = rows.prior_precision[weights] / np.square(sizes[kind[weights]])
         if np.abs(np.concatenate([variance, sizes]) / before - 1).max() < _CONVERGENCE_TOLERANCE:
             break
     return np.repeat(np.sqrt(variance), 3), sizes
@@ -367,12 +369,12 @@ class Effect(NamedTuple):
 
     Attributes:
         effect_sizes: fitted sizes.
-        error_ratio: ratio of the errors without and with the effect [1].
+        error_increase_factor: ratio of the errors without and with the effect [1].
         log_bayes_factor: logarithm of the odds of the effect against none.
     """
 
     effect_sizes: Float64[np.ndarray, " sizes"]
-    error_ratio: float
+    error_increase_factor: float
     log_bayes_factor: float
 
 

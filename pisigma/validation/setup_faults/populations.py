@@ -47,7 +47,7 @@ class Populations:
         in_smaller_population: mask of the measured rows that belong to the smaller population.
         evaluated_rows: number of rows that were evaluated.
         difference: difference of the base, tool or arm parameters of the populations [m or rad].
-        error_ratio: ratio of the errors of the rows without and with the difference [1].
+        error_increase_factor: ratio of the errors of the rows without and with the difference [1].
         absorbed_share: share of the values that all fitted parameters absorb [1].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
@@ -57,7 +57,7 @@ class Populations:
     in_smaller_population: Bool[np.ndarray, " rows"]
     evaluated_rows: int
     difference: Float64[np.ndarray, " numbers"]
-    error_ratio: float
+    error_increase_factor: float
     absorbed_share: float
     log_bayes_factor: float
 
@@ -141,7 +141,7 @@ def _differences(
         Z = rows.motion_derivative(kind)[1]
         yield differing, Z, np.zeros(Z.shape[2])
     active = len(rows.problem.active)
-    yield "arm", rows.jacobian[:, :, :active], rows.precision[:active] / _DIFFERENCE
+    yield "arm", rows.jacobian[:, :, :active], rows.prior_precision[:active] / _DIFFERENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ class _Mixture:
         # Expectation maximisation finds local maxima, so it is started with alternating rows (two arms in turn) and at
         # random.
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (_STARTS - 1, len(some)))]
-        em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
+        em = _Em(r, X, Z, np.r_[self.rows.prior_precision, self.precision])
         states = [em.run(em.start(start), _FIRST_ITERATIONS) for start in starts]
         state = em.run(max(states, key=lambda state: state.log_likelihood), MAX_ITERATIONS)
         difference = state.x[X.shape[2] :]
@@ -299,7 +299,7 @@ class _Em:
 def _one_population(rows: OrderedRows, some: Int64[np.ndarray, " some"]) -> _State:
     """Fit one population to some rows, with the errors and the prior of a mixture, which has to outperform it."""
     X = rows.jacobian[some]
-    alone = _Em(rows.residual[some], X, X[:, :, :0], rows.precision)
+    alone = _Em(rows.residual[some], X, X[:, :, :0], rows.prior_precision)
     return alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
 
 

@@ -39,25 +39,25 @@ class Motion:
     Attributes:
         kind: "frame", "target" (one of several on the tool) or "tool".
         name: name of the frame or the target.
-        rows: indices of the rows of the frame or target in the measurements, in the order of the file.
-        first_row: index in `rows` of the first row after the motion; None for a slow motion over all rows.
+        row_indices: indices of the rows of the frame or target in the measurements, in the order of the file.
+        first_moved_index: index in `row_indices` of the first row after the motion; None for a slow motion.
         shift: mean shift of the measured points [m], in their frame, or for a tool in the flange frame; for a slow
             motion the largest shift since the first row.
         turn: rotation angle of the frame or tool [rad]; for a slow motion the largest angle since the first row.
         log_bayes_factor: logarithm of the odds of the motion against no motion, at equal prior odds.
-        error_ratio: ratio of the errors of the rows without and with the motion in the model [1].
-        begins_frame: whether a target or the tool moved exactly where rows of another frame start.
+        error_increase_factor: ratio of the errors of the rows without and with the motion in the model [1].
+        is_at_frame_start: whether a target or the tool moved exactly where rows of another frame start.
     """
 
     kind: _Moved
     name: str
-    rows: Int64[np.ndarray, " rows"]
-    first_row: int | None
+    row_indices: Int64[np.ndarray, " rows"]
+    first_moved_index: int | None
     shift: Float64[np.ndarray, " 3"]
     turn: float
     log_bayes_factor: float
-    error_ratio: float
-    begins_frame: bool = False
+    error_increase_factor: float
+    is_at_frame_start: bool = False
 
 
 def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
@@ -99,7 +99,7 @@ def _motion_of(rows: OrderedRows) -> Motion | None:
     alike = (
         search.log_bayes_factor(search.reweighted_fit(one), 1.0) > _AS_LIKELY * odds[best] for one in starts
     )
-    return replace(motion, begins_frame=any(alike))
+    return replace(motion, is_at_frame_start=any(alike))
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +269,7 @@ class _Search:
         A = np.concatenate([self.rows.jacobian, np.zeros((*self.rows.jacobian.shape[:2], motions))], 2)
         A[candidate.index, :, size:] = candidate.columns
         A = A.reshape(-1, size + motions)
-        held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
+        held = np.diag(np.concatenate([self.rows.prior_precision, np.zeros(motions)]))
         # Fitted residuals are too small by the root of the share of values that the parameters leave free.
         left = max(1 - (self.rows.effective_parameters + motions) / self.rows.value_count, 1e-2)
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)

@@ -144,12 +144,12 @@ class SessionScene:
         nominal = self._poses(rows.q)[:, :3, 3]
         position = np.where(np.isfinite(rows.position), rows.position, nominal)
         colors = error_colors(np.linalg.norm(rows.error, axis=1), max_error)
-        colors[rows.alarmed] = ALARM
-        if not rows.check.all():
-            self._dots("/rows/measured", position[~rows.check], colors[~rows.check])
-        if rows.check.any():
-            self._dots("/rows/check", position[rows.check], colors[rows.check], shape="diamond")
-        for row in np.flatnonzero(rows.alarmed)[:_MAX_LABELS]:
+        colors[rows.is_unused] = ALARM
+        if not rows.is_test_row.all():
+            self._dots("/rows/measured", position[~rows.is_test_row], colors[~rows.is_test_row])
+        if rows.is_test_row.any():
+            self._dots("/rows/check", position[rows.is_test_row], colors[rows.is_test_row], shape="diamond")
+        for row in np.flatnonzero(rows.is_unused)[:_MAX_LABELS]:
             self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
         self._arrows(position, rows, colors, magnification)
         return position

@@ -156,7 +156,7 @@ def arrow_magnification(max_error: float, reach: float) -> int:
 
 def color_scale_maximum(rows: RowsSoFar) -> float:
     """Return the error at the end of the colour scale: the 95 % quantile of the used rows, rounded up [m]."""
-    errors = np.linalg.norm(rows.error, axis=1)[~rows.alarmed]
+    errors = np.linalg.norm(rows.error, axis=1)[~rows.is_unused]
     errors = errors[np.isfinite(errors)]
     return round_up(float(np.quantile(errors, 0.95))) if errors.size else 1e-3
 

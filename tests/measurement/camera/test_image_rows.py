@@ -69,7 +69,7 @@ def test_a_tracker_adds_information_to_a_camera() -> None:
     )
     assert beyond(cell.true, both.robot) < 0.7 * beyond(cell.true, alone.robot)
     motion = find_motion(both)  # of the rows of the tracker, as those of images are no positions
-    assert motion is None or set(motion.rows) <= set(range(20, 35))
+    assert motion is None or set(motion.row_indices) <= set(range(20, 35))
 
 
 def test_two_cameras_calibrate_one_arm() -> None:

@@ -90,7 +90,7 @@ def test_a_session_finds_swapped_joints_and_the_accuracy(plan: StoredPlan, lines
         session.add(growth.rows, growth.left_out)
         session.update()
     state = session.state
-    wrong = [alarm for alarm in state.alarms if not alarm.counts]
+    wrong = [alarm for alarm in state.alarms if not alarm.row_is_used]
     assert [alarm.line for alarm in wrong] == [2 + CORNERS * SWAPPED]
     assert wrong[0].kind == "swapped"
     assert state.accuracy is not None

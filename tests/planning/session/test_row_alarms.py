@@ -24,7 +24,7 @@ def test_an_unreadable_row_has_to_be_measured_again():
     )
     assert alarm.line == 7
     assert "'abc'" in alarm.sentence
-    assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)
+    assert (alarm.kind, alarm.repeat, alarm.row_is_used) == ("unreadable", True, False)
 
 
 def test_a_frozen_sensor_and_a_row_written_twice():
@@ -37,7 +37,7 @@ def test_a_frozen_sensor_and_a_row_written_twice():
     assert alarm.repeat
     again = Measurements(q=rows.q[2:3], position=rows.position[2:3], line=(6,))
     (alarm,) = stale_reading_alarms(join([rows, again]), 4)
-    assert (alarm.kind, alarm.repeat, alarm.counts) == ("duplicate", False, False)
+    assert (alarm.kind, alarm.repeat, alarm.row_is_used) == ("duplicate", False, False)
     balls = Measurements(q=rows.q[[0, 1, 0]], socket=("a", "a", "a"), line=(2, 3, 4))
     (alarm,) = stale_reading_alarms(balls, 1)
     assert (alarm.kind, alarm.line) == ("duplicate", 4)
@@ -51,7 +51,7 @@ def test_joint_values_off_the_plan_are_a_remark():
     assert "1.20 deg" in near.sentence
     assert "pose 2 of the plan" in near.sentence
     assert not any(name in far.sentence for name in NAMES)
-    assert near.counts
+    assert near.row_is_used
     assert not near.repeat
     (alarm,) = unplanned_joint_alarms(ROBOT, PLAN.measure(q[:1].deg2rad()), 0, PLAN.stored.q, NAMES)
     assert "pose 1 of the plan" in alarm.sentence

@@ -62,8 +62,8 @@ def test_links_too_thick_to_be_separated_are_named(links: dict[str, object], nam
     arm = ArmInSurroundings.from_robot(
         Robot.load("ur10"), Surroundings(links=LinkSection.model_validate(links))
     )
-    assert len(arm.unseparated_links) == (named is not None)
-    assert named is None or named in arm.unseparated_links[0]
+    assert len(arm.unchecked_link_sentences) == (named is not None)
+    assert named is None or named in arm.unchecked_link_sentences[0]
 
 
 def test_a_motion_is_free_where_all_poses_on_it_are():

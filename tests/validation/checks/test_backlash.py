@@ -124,7 +124,7 @@ def test_an_elastic_arm_under_load_without_play_raises_no_alarm(seed):
     assert unstated_backlash(GeometricCalibrator(robot), sided(rows)) is None
     ordered = OrderedRows.from_result(GeometricCalibrator(robot).fit(rows))
     assert (ordered.noise > 1.5e-4).all()
-    assert_close(ordered.with_own_noise.noise, 3e-5, rtol=0.15)
+    assert_close(ordered.with_estimated_noise.noise, 3e-5, rtol=0.15)
 
 
 @pytest.mark.parametrize("before", [True, False])

@@ -77,7 +77,7 @@ def test_a_frame_that_moved_is_found_with_its_row_and_amount(turned: bool, first
     assert diagnostic.values["first_line"] == first + FIRST_LINE
     motion = find_motion(GeometricCalibrator(simulated.nominal).fit(rows))
     assert motion is not None
-    assert motion.first_row == first
+    assert motion.first_moved_index == first
     assert_close(motion.shift, SHIFT, atol=2e-4)
     assert_close(np.rad2deg(motion.turn), 1.0, atol=0.03)
     apart = with_new_frames(rows, [first + FIRST_LINE])

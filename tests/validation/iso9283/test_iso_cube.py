@@ -19,13 +19,13 @@ def test_corners_by_hand():
 def test_five_poses_by_hand():
     # a tenth of the diagonal from C1 (2, 3, 4), C2 (0, 3, 4), C7 (0, 1, 2), C8 (2, 1, 2)
     wanted = [[1, 2, 3], [1.8, 2.8, 3.8], [0.2, 2.8, 3.8], [0.2, 1.2, 2.2], [1.8, 1.2, 2.2]]
-    assert_close(CUBE.poses(), wanted, atol=1e-12)
+    assert_close(CUBE.test_positions(), wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize("plane", PLANES)
 @pytest.mark.parametrize("share", [0.08, 0.1, 0.12])
 def test_poses_lie_on_diagonals_of_a_plane_through_the_centre(plane: str, share: float):
-    poses, diagonal = CUBE.poses(plane, share), 2 * 3**0.5
+    poses, diagonal = CUBE.test_positions(plane, share), 2 * 3**0.5
     assert_close(poses[0], CUBE.centre)
     off = poses[1:] - CUBE.centre
     assert_close(off.norm(dim=-1), (0.5 - share) * diagonal, atol=1e-12)
@@ -37,9 +37,9 @@ def test_poses_lie_on_diagonals_of_a_plane_through_the_centre(plane: str, share:
 
 def test_what_the_standard_does_not_allow_is_refused():
     with refused(MeasurementError, option="diagonal_fraction", value=0.2):
-        CUBE.poses(diagonal_fraction=0.2)
+        CUBE.test_positions(diagonal_fraction=0.2)
     with refused(MeasurementError, option="plane", value="C1-C2-C7"):
-        CUBE.poses("C1-C2-C7")
+        CUBE.test_positions("C1-C2-C7")
 
 
 REGION = torch.full((3,), -1.0).double(), torch.full((3,), 1.0).double()
