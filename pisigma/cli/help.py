@@ -30,7 +30,7 @@ class ShortHelpCommand(TyperCommand):
     def keys(self) -> dict[str, Setting]:
         """Return the settings without an option, by key."""
         known: dict[str, Setting] = getattr(self.callback, SETTINGS, {})
-        return {key: one for key, one in known.items() if one.option.is_key}
+        return {key: one for key, one in known.items() if one.option.is_key_only}
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options briefly, with their number, or in full with the keys of `--set`."""

@@ -63,7 +63,7 @@ def import_(
         return _write_joint_log(files, chosen, out, as_json)
     if cell is not None:
         incoming = IncomingRows(tuple(files), Cell.open(cell), chosen)
-        if not incoming.is_ready:
+        if not incoming.needs_no_conversion:
             _confirm(incoming.proposal, yes, as_json)
             if save_map is not None:
                 incoming.proposal.save_map(save_map)
@@ -78,7 +78,7 @@ def import_(
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
-    print_lines([*rows.sentences, f"{rows.rows} measurements written to {out}."])
+    print_lines([*rows.sentences, f"{rows.row_count} measurements written to {out}."])
 
 
 def _write_joint_log(files: list[Path], settings: ImportSettings, out: Path, as_json: bool) -> None:

@@ -85,4 +85,4 @@ class _Shown:
 
     def _line(self, what: str) -> str:
         """Return the line of the current step, with the time left if steps are numbered."""
-        return make_printable(f"{self.title}: {self.left.after(what)}")
+        return make_printable(f"{self.title}: {self.left.text_with_time_left(what)}")

@@ -62,12 +62,12 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
         groups[one.name] = group, bool(others)  # type: ignore[assignment]
         if get_origin(one.annotation) is StatedSettings:
             as_stated.add(one.name)
-        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type: ignore[arg-type]
+        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key_only]  # type: ignore[arg-type]
         end = len(parameters)
     known = {key: one for group, _ in groups.values() for key, one in settings_by_key(group).items()}
     context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)
     by_name = inspect.Parameter.KEYWORD_ONLY
-    if any(one.option.is_key for one in known.values()):
+    if any(one.option.is_key_only for one in known.values()):
         parameters.insert(end, _assignments(known))
     if context == _CONTEXT:
         parameters.append(inspect.Parameter(_CONTEXT, by_name, annotation=typer.Context))
@@ -105,7 +105,7 @@ def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) 
     """Remove the options of settings from the values of a command, and return the stated settings by key."""
     stated = read_assignments(values.pop(_SET, None) or (), known, "--set")
     for key, setting in known.items():
-        if setting.option.is_key:
+        if setting.option.is_key_only:
             continue
         value = values.pop(_name(setting))
         if running.get_parameter_source(_name(setting)).name != "COMMANDLINE":

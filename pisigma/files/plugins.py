@@ -28,11 +28,11 @@ class Plugins:
 
     Attributes:
         files: absolute paths in the order of loading.
-        installed: whether the entry points of installed packages were loaded.
+        includes_installed: whether the entry points of installed packages were loaded.
     """
 
     files: tuple[str, ...] = ()
-    installed: bool = False
+    includes_installed: bool = False
 
     def load(self) -> None:
         """Load the plug-ins that this process has not loaded yet.
@@ -40,7 +40,7 @@ class Plugins:
         Raises:
             PluginError: a file or an entry point cannot be loaded.
         """
-        if self.installed:
+        if self.includes_installed:
             load_installed()
         load_files(self.files)
 
@@ -60,7 +60,7 @@ def load_installed() -> None:
         PluginError: a module cannot be imported.
     """
     global _loaded
-    if _loaded.installed:
+    if _loaded.includes_installed:
         return
     from importlib.metadata import entry_points  # imported here, because it takes 0.1 s
 
@@ -88,7 +88,7 @@ def load_files(files: Iterable[str | os.PathLike[str]]) -> None:
             )
         with _as_plugin("the plug-in", "correct the file", file):
             _run(path)
-        _loaded = Plugins((*_loaded.files, str(path)), _loaded.installed)
+        _loaded = Plugins((*_loaded.files, str(path)), _loaded.includes_installed)
 
 
 def _run(path: Path) -> None:

@@ -52,7 +52,7 @@ class TimeLeft:
         self._first: tuple[float, float] | None = None
         self._last = 0.0
 
-    def after(self, message: str) -> str:
+    def text_with_time_left(self, message: str) -> str:
         """Return the text of the current step, with the estimated time left if the steps are numbered."""
         share, now = completed_fraction(message), time.monotonic()
         if share is None:

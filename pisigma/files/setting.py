@@ -35,7 +35,8 @@ class Option:
         max: largest value that is accepted.
         metavar: placeholder of the value in the help.
         default: default that the help shows, if the setting's default has another type.
-        is_key: whether the setting has no option of its own and is set by its key, in `cell.yaml` and with `--set`.
+        is_key_only: whether the setting has no option of its own and is set by its key, in `cell.yaml` and with
+            `--set`.
         hidden: whether the setting can be set only in Python.
         help: help of the option if it differs from the description of the setting, as of `--no-history`.
     """
@@ -48,14 +49,14 @@ class Option:
     max: float | int | None = None
     metavar: str | None = None
     default: Any = None
-    is_key: bool = False
+    is_key_only: bool = False
     hidden: bool = False
     help: str = ""
 
 
 HIDDEN = Option(hidden=True)
 """Annotation of settings that can be set only in Python."""
-KEY = Option(is_key=True)
+KEY = Option(is_key_only=True)
 """Annotation of settings that have a key in `cell.yaml` but no option."""
 FILE = Option(kind=Path, read=str)
 """Annotation of settings that are paths, stored as text."""
@@ -113,7 +114,7 @@ class Setting:
     @property
     def spelling(self) -> str:
         """Spelling of the setting on the command line, such as "--folds" or "--set seed"."""
-        return f"--set {self.key}" if self.option.is_key else self.name
+        return f"--set {self.key}" if self.option.is_key_only else self.name
 
     def read(self, value: Any) -> Any:
         """Convert a command-line value to the setting."""

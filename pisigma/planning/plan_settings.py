@@ -120,9 +120,9 @@ class PlanSettings:
     criterion: Annotated[Criterion, KEY] = "I"
     limit_mm: float | None = None
     candidates: Annotated[int, KEY] = 5000
-    candidates_from: Annotated[str | None, Option(kind=Path, read=str, is_key=True)] = None
+    candidates_from: Annotated[str | None, Option(kind=Path, read=str, is_key_only=True)] = None
     box_mm: Annotated[
-        Box | None, Option("--box", kind=str, read=parse_box, metavar="X,Y,Z,X,Y,Z", is_key=True)
+        Box | None, Option("--box", kind=str, read=parse_box, metavar="X,Y,Z,X,Y,Z", is_key_only=True)
     ] = None
     task: Annotated[str | None, FILE] = None
     measured: Annotated[str | None, FILE] = None

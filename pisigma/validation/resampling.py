@@ -22,7 +22,7 @@ class Bootstrap:
         confidence: confidence level of an interval.
     """
 
-    resamples: Annotated[int, Option(min=2, is_key=True)] = 2000
+    resamples: Annotated[int, Option(min=2, is_key_only=True)] = 2000
     seed: Annotated[int, KEY] = 0
     confidence: Annotated[float, HIDDEN] = 0.95
 

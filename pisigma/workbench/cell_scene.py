@@ -207,7 +207,7 @@ class CellScene:
                 self._scene.add_rows(q)
         self._server.flush()
 
-    def mark_lines(self, file_lines: list[int]) -> None:
+    def mark_rows_of_lines(self, file_lines: list[int]) -> None:
         """Mark the rows of some lines in red with their numbers, and move the camera to the first of these rows."""
         with self._lock, self._server.atomic():
             self._marked = file_lines

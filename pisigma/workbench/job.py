@@ -28,27 +28,27 @@ class Outcome:
     Attributes:
         text: the result for people; None if the step was refused.
         refusal: reason why the input was refused or the result is not accepted.
-        rows: wrong rows (file and line), by the sentences of the findings that name them.
-        field: field of the form that causes the refusal; "" if no field does.
+        wrong_rows_by_sentence: wrong rows (file and line), by the sentences of the findings that name them.
+        refused_field: field of the form that causes the refusal; "" if no field does.
         subject: object of the step, such as a session; "" if the step implies it.
         accuracy_curve: expected accuracy by number of poses; () without a curve.
         stopped: whether a person stopped it.
         step: name of the step.
         command: command line that has the same effect.
-        person: who started the step.
+        started_by: who started the step.
         end_time: day and time at which the step ended.
     """
 
     text: ResultText | None = None
     refusal: str = ""
-    rows: Mapping[str, str] = field(default_factory=dict)
-    field: str = ""
+    wrong_rows_by_sentence: Mapping[str, str] = field(default_factory=dict)
+    refused_field: str = ""
     subject: str = ""
     accuracy_curve: tuple[Any, ...] = ()
     stopped: bool = False
     step: str = ""
     command: str = ""
-    person: str = ""
+    started_by: str = ""
     end_time: str = ""
 
 
@@ -61,18 +61,18 @@ class Job:
 
     Attributes:
         step: name of the step.
-        person: who started the step.
+        started_by: who started the step.
         command: command line that has the same effect.
         activity: the current activity, with the time left.
         stopped_by: name of the person who asked to stop the step; "" if nobody did.
     """
 
     step: str
-    person: str
+    started_by: str
     command: str
     activity: str = ""
     stopped_by: str = ""
-    started: str = field(default_factory=lambda: _clock())
+    start_time: str = field(default_factory=lambda: _clock())
     time_left: TimeLeft = field(default_factory=TimeLeft)
 
     def progress(self, message: str) -> None:
@@ -83,7 +83,7 @@ class Job:
         """
         if self.stopped_by:
             raise StoppedError
-        self.activity = self.time_left.after(message)
+        self.activity = self.time_left.text_with_time_left(message)
 
 
 class Jobs:
@@ -160,7 +160,7 @@ class Jobs:
             )
         with self._lock:
             self.outcomes[job.step] = replace(
-                found, step=job.step, command=job.command, person=job.person, end_time=_clock()
+                found, step=job.step, command=job.command, started_by=job.started_by, end_time=_clock()
             )
             self.running = None
             self.version, self.ended = self.version + 1, self.ended + 1

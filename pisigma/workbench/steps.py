@@ -130,7 +130,7 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     return Outcome(
         _in_cell(text, cell),
         _NOT_STORED if entry is None else "",
-        rows=wrong_rows_by_sentence(found.summary.diagnostics),
+        wrong_rows_by_sentence=wrong_rows_by_sentence(found.summary.diagnostics),
     )
 
 
@@ -142,7 +142,9 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
     used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
     text = replace(verification_text(found, _WIDTH), closing_sentences=tuple(used))
     refusal = "" if found.accepted else found.sentence
-    return Outcome(_in_cell(text, cell), refusal, rows=wrong_rows_by_sentence(found.diagnostics))
+    return Outcome(
+        _in_cell(text, cell), refusal, wrong_rows_by_sentence=wrong_rows_by_sentence(found.diagnostics)
+    )
 
 
 def wrong_rows_by_sentence(findings: Sequence[Diagnostic]) -> dict[str, str]:

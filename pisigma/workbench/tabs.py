@@ -176,7 +176,7 @@ class Tabs:
         """
         names = [one.name for one in incoming.files]
         return self._environment.get_template("proposal.html.j2").render(
-            mappings=() if incoming.is_ready else incoming.proposal.mappings,
+            mappings=() if incoming.needs_no_conversion else incoming.proposal.mappings,
             forms=form_of("import", incoming.cell.file),
             files=names,
             words=shlex.join(names),

@@ -27,11 +27,11 @@ class UploadedRowsHandler:
 
     Attributes:
         folder: folder of the cell.
-        growing: file to which an instrument writes rows; None for none.
+        growing_file: file to which an instrument writes rows; None for none.
     """
 
     folder: Path
-    growing: Path | None
+    growing_file: Path | None
     _uploads: Uploads
     _tabs: Tabs
     _scene: CellScene
@@ -69,7 +69,9 @@ class UploadedRowsHandler:
                 found = incoming.check(form.get("date", "").strip())
             except PisigmaError as problem:
                 return self._uploads.without_folder(self._tabs.render_findings(incoming, (), str(problem)))
-            self._scene.mark_lines(line_numbers_in(" ".join(row for one in found for row in one.rows)))
+            self._scene.mark_rows_of_lines(
+                line_numbers_in(" ".join(row for one in found for row in one.rows))
+            )
             return self._uploads.without_folder(self._tabs.render_findings(incoming, found))
 
         return web.Response(text=await asyncio.to_thread(check), content_type="text/html")
@@ -86,7 +88,7 @@ class UploadedRowsHandler:
                     rows = cell.sessions.rows_of_file(session)
                     self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
                     break
-            self._scene.mark_lines(line_numbers_in(text))
+            self._scene.mark_rows_of_lines(line_numbers_in(text))
 
         await asyncio.to_thread(show)
         return web.json_response({})
@@ -94,5 +96,9 @@ class UploadedRowsHandler:
     def _incoming(self, cell: Cell, form: Mapping[str, str]) -> IncomingRows:
         """Return the uploaded files of a form, or the growing file."""
         numbers = form.get("files", "").split(",")
-        files = [self.growing] if numbers == [_GROWING] and self.growing else self._uploads.paths(numbers)
+        files = (
+            [self.growing_file]
+            if numbers == [_GROWING] and self.growing_file
+            else self._uploads.paths(numbers)
+        )
         return steps.incoming_rows(files, cell, form)

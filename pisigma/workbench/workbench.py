@@ -187,9 +187,9 @@ class Workbench(UploadedRowsHandler):
         job, version, ended = self.jobs.state()
         running = job and {
             "step": job.step,
-            "person": job.person,
+            "person": job.started_by,
             "what": job.activity,
-            "started": job.started,
+            "started": job.start_time,
             "stopped_by": job.stopped_by,
         }
         said = {
@@ -249,7 +249,7 @@ class Workbench(UploadedRowsHandler):
                 return found
             except PisigmaError as problem:
                 field = problem.option or str(problem.column or "")
-                return Outcome(refusal=self._uploads.without_folder(str(problem)), field=field)
+                return Outcome(refusal=self._uploads.without_folder(str(problem)), refused_field=field)
             finally:
                 with self._reading:  # values that were read before the step ended are out of date
                     self._status = self._status[0], -math.inf

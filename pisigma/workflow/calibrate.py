@@ -73,7 +73,7 @@ class Calibration(AbstractModelResult):
         card_texts: description of the model, and limits of its validation.
         settings: settings of the calibration; None for a recipe.
         seconds: computing time [s].
-        has_figures: whether the card has figures.
+        has_drawn_figures: whether the card has figures.
     """
 
     model: CalibratedModel
@@ -86,7 +86,7 @@ class Calibration(AbstractModelResult):
     card_texts: CardTexts
     settings: CalibrationSettings | None = None
     seconds: float = 0.0
-    has_figures: bool = True
+    has_drawn_figures: bool = True
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -94,7 +94,7 @@ class Calibration(AbstractModelResult):
         return self.summary.warnings
 
     @property
-    def position_errors_mm(self) -> tuple[float | None, float | None]:
+    def held_out_p95_and_best_known_rms_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors [mm]; see `AbstractModelResult`."""
         judged, fitted = self.summary.validation_errors, self.summary.calibrated
         if judged is not None:
@@ -105,7 +105,7 @@ class Calibration(AbstractModelResult):
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
         judged = self.validation or self.test
         write_calibration_card(
-            model, self.result, self.rows, judged, summary, self.card_texts, folder, self.has_figures
+            model, self.result, self.rows, judged, summary, self.card_texts, folder, self.has_drawn_figures
         )
         if self.held_out is not None:
             text = self.held_out.to_csv(model.robot)

@@ -39,9 +39,9 @@ class ComparedModels:
         models: the first and the second model by their names in tables.
         settings: settings of the comparison.
         parameters: all parameters side by side, and the parameters that differ.
-        workspace: distances between the tool poses of both models over the workspace.
-        rows: errors of both models on the same rows; None if no rows are given.
-        program: distances along a program that was taught with the first model; None if no program is given.
+        workspace_displacement: distances between the tool poses of both models over the workspace.
+        row_comparison: errors of both models on the same rows; None if no rows are given.
+        program_displacement: distances along a program that was taught with the first model; None without a program.
         diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
         warnings: sentences that warn of problems.
         seconds: computing time [s].
@@ -50,9 +50,9 @@ class ComparedModels:
     models: dict[str, CalibratedModel]
     settings: ComparisonSettings
     parameters: ParameterDifferences
-    workspace: Displacement
-    rows: ModelComparison | None
-    program: Displacement | None
+    workspace_displacement: Displacement
+    row_comparison: ModelComparison | None
+    program_displacement: Displacement | None
     diagnostics: tuple[Diagnostic, ...]
     warnings: tuple[str, ...]
     seconds: float
@@ -70,8 +70,8 @@ class ComparedModels:
     @property
     def displacements(self) -> dict[str, Displacement]:
         """Return distances between the tools over the workspace and, if there is a program, along the program."""
-        along = {} if self.program is None else {f"along {self.program.source}": self.program}
-        return {f"over {self.workspace.source}": self.workspace, **along}
+        over, along = self.workspace_displacement, self.program_displacement
+        return {f"over {over.source}": over} | ({} if along is None else {f"along {along.source}": along})
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -84,7 +84,7 @@ class ComparedModels:
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values, in mm and deg: the result of `pisigma compare --json`."""
-        differences, (first, _) = self.parameters, self.models.values()
+        differences, rows, (first, _) = self.parameters, self.row_comparison, self.models.values()
         return {
             "models": [{"name": name, "kind": model.kind} for name, model in self.models.items()],
             "robot": first.robot.name,
@@ -94,10 +94,12 @@ class ComparedModels:
             "parameters": [_parameter_json(one) for one in differences.parameters],
             "frames_moved": [one.to_json() for one in differences.frames],
             "remainder": None if differences.remainder is None else vars(differences.remainder),
-            "workspace": self.workspace.to_json(first.robot),
-            "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better_model},
+            "workspace": self.workspace_displacement.to_json(first.robot),
+            "rows": None if rows is None else {**rows.to_json(), "better": self.better_model},
             "diagnostics": [one.model_dump() for one in self.diagnostics],
-            "program": None if self.program is None else self.program.to_json(first.robot),
+            "program": None
+            if self.program_displacement is None
+            else self.program_displacement.to_json(first.robot),
             "summary": list(self.sentences),
             "warnings": list(self.warnings),
             "seconds": round(self.seconds, 3),
@@ -113,48 +115,48 @@ class ComparedModels:
 
         check_page(Path(page))
         says = self.sentences, self.warnings
-        text = comparison_page(self.models, self.parameters, self.displacements, self.rows, says)
+        text = comparison_page(self.models, self.parameters, self.displacements, self.row_comparison, says)
         write_atomically(Path(page), text)
 
     @property
     def _difference(self) -> Difference | None:
-        return None if self.rows is None else self.rows.models[1].position.difference
+        return None if self.row_comparison is None else self.row_comparison.models[1].position.difference
 
     def _displacements_in_words(self) -> tuple[str, ...]:
         """Return a text on the distances between the tools over the workspace and along a program."""
         first, second = self.models
-        figures = self.workspace.errors.figures.figures_by_name
+        figures = self.workspace_displacement.errors.figures.figures_by_name
         where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
         lines = [
             f"Over the workspace, the tool positions of {second} and {first} differ by {figures['rms_mm']:.3f} mm (RMS)"
             f"{where}, at most by {figures['max_mm']:.3f} mm."
         ]
-        if self.program is not None:
-            figures, largest = self.program.errors.figures.figures_by_name, self.program.index_of_largest
+        if (program := self.program_displacement) is not None:
+            figures, largest = program.errors.figures.figures_by_name, program.index_of_largest
             lines.append(
-                f"The poses of {self.program.source}, taught with {first}, are off by {figures['rms_mm']:.3f} mm (RMS) "
-                f"under {second}, at most by {figures['max_mm']:.3f} mm at pose {int(self.program.number[largest])}."
+                f"The poses of {program.source}, taught with {first}, are off by {figures['rms_mm']:.3f} mm (RMS) "
+                f"under {second}, at most by {figures['max_mm']:.3f} mm at pose {int(program.number[largest])}."
             )
         return tuple(lines)
 
     def _rows_in_words(self) -> tuple[str, ...]:
         """Return a text that states which model predicts the rows better."""
-        difference = self._difference
-        if difference is None or self.rows is None:
+        difference, rows = self._difference, self.row_comparison
+        if difference is None or rows is None:
             return ()
         errors = " and ".join(
-            f"{one.position.statistics['rms']:.3f} mm under {one.name}" for one in self.rows.models
+            f"{one.position.statistics['rms']:.3f} mm under {one.name}" for one in rows.models
         )
         if self.diagnostics:
             doubts = " ".join(one.sentence for one in self.diagnostics)
-            return (f"The RMS error of {self.rows.rows} rows is {errors}, which is not conclusive: {doubts}",)
+            return (f"The RMS error of {rows.rows} rows is {errors}, which is not conclusive: {doubts}",)
         which = (
             f"{self.better_model} predicts them better"
             if self.better_model
             else "neither predicts them significantly better"
         )
         return (
-            f"The RMS error of {self.rows.rows} rows is {errors}: {which} (Wilcoxon's p {difference.test.p:.2g}).",
+            f"The RMS error of {rows.rows} rows is {errors}: {which} (Wilcoxon's p {difference.test.p:.2g}).",
         )
 
 
@@ -218,9 +220,9 @@ def compare(
         models=models,
         settings=settings,
         parameters=parameter_differences(pair, settings.level),
-        workspace=Displacement.from_pair(pair, pair.workspace, "the workspace"),
-        rows=compared,
-        program=None
+        workspace_displacement=Displacement.from_pair(pair, pair.workspace, "the workspace"),
+        row_comparison=compared,
+        program_displacement=None
         if program is None
         else Displacement.from_pair(pair, read_task(program, pair.first), Path(program).name),
         diagnostics=diagnostics,

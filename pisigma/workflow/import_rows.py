@@ -88,7 +88,7 @@ class ImportedRows:
     warnings: tuple[str, ...]
 
     @property
-    def rows(self) -> int:
+    def row_count(self) -> int:
         """Number of measurements."""
         return len(self.measurement_table.table.records)
 
@@ -120,7 +120,7 @@ class ImportedRows:
     def to_json(self) -> dict[str, object]:
         """Return a summary of imported and omitted rows as plain values."""
         return {
-            "rows": self.rows,
+            "rows": self.row_count,
             "files": [file.to_json() for file in self.accounts],
             "columns": self.proposal.columns_json(),
             "left_out": [row.to_json() for row in self.left_out],

@@ -92,8 +92,8 @@ class MonitoringResult:
 
     Attributes:
         model: the model with which the sessions were compared.
-        sessions: sessions of this call.
-        records: all sessions of the model, including sessions of its history, in the order of their dates.
+        sessions_of_call: sessions of this call.
+        all_sessions: all sessions of the model, including sessions of its history, in the order of their dates.
         charts: control charts of the joint zeros and of the error, over all sessions.
         trends: trends of the joint zeros.
         jumps: jumps of the joint zeros between two sessions.
@@ -106,8 +106,8 @@ class MonitoringResult:
     """
 
     model: CalibratedModel
-    sessions: tuple[Record, ...]
-    records: tuple[Record, ...]
+    sessions_of_call: tuple[Record, ...]
+    all_sessions: tuple[Record, ...]
     charts: tuple[Chart, ...]
     trends: tuple[Trend, ...]
     jumps: tuple[Jump, ...]
@@ -127,7 +127,7 @@ class MonitoringResult:
             bool(self.untrusted_sessions)
             or alarmed
             or exceeded
-            or any(one.session.recalibrate for one in self.sessions)
+            or any(one.session.recalibrate for one in self.sessions_of_call)
         )
 
     @property
@@ -136,11 +136,11 @@ class MonitoringResult:
 
         None if there is no such session, or if a later session that observes as many joints agrees with the model.
         """
-        paying = [one for one in self.sessions if one.session.recalibrate]
+        paying = [one for one in self.sessions_of_call if one.session.recalibrate]
         if not paying:
             return None
         known = sum(paying[-1].session.observable)
-        later = [one for one in self.records if one.date > paying[-1].date]
+        later = [one for one in self.all_sessions if one.date > paying[-1].date]
         outdated = any(not one.session.recalibrate and sum(one.session.observable) >= known for one in later)
         return None if outdated else paying[-1]
 
@@ -149,7 +149,7 @@ class MonitoringResult:
         """Return results of all sessions as sentences: alarms, clear trends, the forecast, and the next step."""
         alarms = (
             f"{'the RMS error' if chart.one_sided else chart.quantity} has been outside the limits "
-            f"({' and '.join(chart.kinds)}) since {self.records[chart.alarm].date}."
+            f"({' and '.join(chart.kinds)}) since {self.all_sessions[chart.alarm].date}."
             for chart in self.charts
             if chart.alarm is not None
         )
@@ -177,10 +177,10 @@ class MonitoringResult:
             "seconds": round(self.seconds, 3),
             "model": self.model.name,
             "action": self.needs_action,
-            "sessions": [one.to_json() for one in self.sessions],
+            "sessions": [one.to_json() for one in self.sessions_of_call],
             "untrusted": [one.to_json() for one in self.untrusted_sessions],
-            "history": [one.to_json() for one in self.records],
-            "charts": [one.to_json([record.date for record in self.records]) for one in self.charts],
+            "history": [one.to_json() for one in self.all_sessions],
+            "charts": [one.to_json([record.date for record in self.all_sessions]) for one in self.charts],
             "false_alarms_per_year": FALSE_ALARMS_PER_YEAR,
             "sessions_per_year": SESSIONS_PER_YEAR,
             "trends": [one.to_json() for one in self.trends],
@@ -201,7 +201,7 @@ class MonitoringResult:
         check_page(Path(page))
         content = monitoring_page(
             self.model,
-            self.records,
+            self.all_sessions,
             self.charts,
             self.sentences,
             self.warnings,
@@ -299,8 +299,8 @@ def monitor(
         records = tuple(one for one in records if is_date(one.date))
     return MonitoringResult(
         model=loaded,
-        sessions=new,
-        records=records,
+        sessions_of_call=new,
+        all_sessions=records,
         charts=charts_of(loaded.robot.joints, records) if records else (),
         trends=trends_of(loaded.robot.joints, records) if records else (),
         jumps=jumps_of(loaded.robot.joints, records) if records else (),

@@ -81,12 +81,12 @@ class Plan:
     seconds: float
 
     @property
-    def poses(self) -> int:
+    def calibration_pose_count(self) -> int:
         """Number of poses to calibrate with."""
         return int((~self.stored_plan.is_test_pose).sum())
 
     @property
-    def check_poses(self) -> int:
+    def test_pose_count(self) -> int:
         """Number of poses to test the calibration with."""
         return int(self.stored_plan.is_test_pose.sum())
 
@@ -103,8 +103,8 @@ class Plan:
         """Return the figures as plain values: the result of `pisigma plan --json`."""
         last, settings = self.accuracy_curve[-1], self.stored_plan.settings
         return {
-            "poses": self.poses,
-            "check_poses": self.check_poses,
+            "poses": self.calibration_pose_count,
+            "check_poses": self.test_pose_count,
             "criterion": settings.criterion,
             "candidates": len(self.candidates.q),
             "refused": dict(self.candidates.refused.most_common()),

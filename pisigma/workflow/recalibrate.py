@@ -88,7 +88,7 @@ class Recalibration(AbstractModelResult):
         return self.summary.warnings
 
     @property
-    def position_errors_mm(self) -> tuple[float | None, float | None]:
+    def held_out_p95_and_best_known_rms_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors of held-out rows [mm]; see `AbstractModelResult`."""
         p95 = self.candidate_choice.p95.get(self.candidate_choice.kept)
         return None if p95 is None else p95 * 1e3, self.summary.cross_validation[

@@ -42,7 +42,7 @@ class AbstractModelResult(ABC):
         return not any(one.severity == "implausible" for one in self.diagnostics)
 
     @property
-    def position_errors_mm(self) -> tuple[float | None, float | None]:
+    def held_out_p95_and_best_known_rms_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors [mm]; None if unknown.
 
         Both refer to held-out rows; without a validation, the RMS refers to the rows of the calibration.

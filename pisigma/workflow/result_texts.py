@@ -74,11 +74,14 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     """Return the verdict on the expected accuracy of a calibration with the poses."""
     last, settings, warnings = planned.accuracy_curve[-1], planned.stored_plan.settings, planned.warnings
     cautions = f"with caution ({count_text(len(warnings), 'warning')})" if warnings else "yes"
-    checked = f"; {count_text(planned.check_poses, 'pose')} will check it" if planned.check_poses else ""
+    checked = (
+        f"; {count_text(planned.test_pose_count, 'pose')} will check it" if planned.test_pose_count else ""
+    )
     more = "" if planned.accuracy_curve[0].poses else "more "
     return Verdict(
         f"{rounded_text(last.rms * 1e3)} mm RMS and {rounded_text(last.p95 * 1e3)} mm (95 %) expected for the tool "
-        f"position with {planned.poses} {more}poses; {rounded_text(last.random_rms * 1e3)} mm RMS with random poses.",
+        f"position with {planned.calibration_pose_count} {more}poses; {rounded_text(last.random_rms * 1e3)} mm RMS "
+        "with random poses.",
         f"{cautions}, if the sensor scatters as stated{checked}.",
         f"measure the poses, about {planned.duration / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
         f"{settings.settling_s:g} s per pose, with `pisigma measure {file} --rows ROWS.csv`.",
@@ -96,7 +99,8 @@ def _curve_lines(planned: Plan) -> list[str]:
         )
     if limit is not None and planned.poses_needed is None:
         lines.append(
-            f"More than {planned.poses} poses are needed to keep 95 % of the errors below {limit:g} mm."
+            f"More than {planned.calibration_pose_count} poses are needed to keep 95 % of the errors below "
+            f"{limit:g} mm."
         )
     elif limit is not None:
         needed = f"With {planned.poses_needed}" if planned.poses_needed else "Without more"
@@ -133,10 +137,12 @@ def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[st
         monitoring: the monitoring.
         closing_sentences: sentence on the written files.
     """
-    sessions, name = monitoring.sessions, monitoring.model.name
+    sessions, name = monitoring.sessions_of_call, monitoring.model.name
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
     unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
-    charts = table_block(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
+    charts = table_block(
+        f"charts of {len(monitoring.all_sessions)} sessions", *chart_table(monitoring.charts)
+    )
     advice = next((line for line in monitoring.sentences if "`pisigma " in line), "")
     together = [one for one in monitoring.sentences if one != advice]
     details = (
@@ -150,7 +156,7 @@ def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[st
             sentence_block("conclusions from all sessions", together),
             sentence_block("what has changed", [*said[-_MAX_SESSIONS:], *unobservable], "  "),
             table_block(f"last sessions of {name}", *session_table(sessions[-_MAX_SESSIONS:])),
-            *([charts] if len(monitoring.records) > 1 else []),
+            *([charts] if len(monitoring.all_sessions) > 1 else []),
         ),
         details if len(sessions) > _MAX_SESSIONS else (),
         tuple(closing_sentences),
@@ -159,7 +165,7 @@ def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[st
 
 def _monitoring_verdict(monitoring: MonitoringResult, advice: str) -> Verdict:
     """Return the verdict on a robot from its sessions; `advice` states how to recalibrate it if this is recommended."""
-    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted_sessions)
+    sessions, untrusted = monitoring.sessions_of_call, len(monitoring.untrusted_sessions)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
     last = (
         f"{sessions[-1].date}, {rounded_text(sessions[-1].session.rms * 1e3, 0)} mm RMS"

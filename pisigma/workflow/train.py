@@ -178,7 +178,7 @@ def _train_hybrid(
     if settings.resume:
         _refuse_resume(recipe)
     rows = data.training
-    measured = data.folds is not None
+    measured = data.fold_settings is not None
     judged, splits = data.splits()
     calibrator = recipe.calibrator(data.robot)
     started = time.perf_counter()
@@ -222,7 +222,7 @@ def _train_inverse(
     progress: Progress,
 ) -> InverseTraining:
     run = train_networks(recipe, data, settings, sha256)
-    validation = None if data.folds is None else cross_validate(recipe, data, progress, settings.jobs)
+    validation = None if data.fold_settings is None else cross_validate(recipe, data, progress, settings.jobs)
     test = None
     if data.test is not None:
         test = ComparisonFigures.from_comparison(
@@ -254,7 +254,7 @@ def train_networks(
     from pisigma.network.trainer import Checkpoints
 
     robot, measurements = data.robot, data.training
-    if data.folds is not None:
+    if data.fold_settings is not None:
         _check_one_pose(measurements)
         robot = fit_base_and_tool(robot, measurements).robot
     bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
@@ -311,7 +311,7 @@ def cross_validate(
         RecipeError: the recipe simulates its data.
         MeasurementError: there are fewer different joint vectors than folds.
     """
-    if data.folds is None:
+    if data.fold_settings is None:
         raise RecipeError(
             f"expected a recipe for measured data, got '{recipe.name}', which simulates training and held-out rows",
             value=recipe.name,

@@ -78,8 +78,8 @@ class Verification:
             recommended; "setup_fault" if a setup fault explains the errors, which then prove nothing; "implausible" if
             the errors are too large for a calibrated robot and no fault explains them.
         sentence: sentence that states the verdict with figures.
-        ratio: mean position error of the corrected model divided by the mean position error of the nominal robot;
-            NaN if the latter is 0.
+        corrected_to_nominal_error_ratio: mean position error of the corrected model divided by that of the nominal
+            robot; NaN if the latter is 0.
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
         diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
@@ -96,7 +96,7 @@ class Verification:
     settings: VerificationSettings
     verdict: Verdict
     sentence: str
-    ratio: float
+    corrected_to_nominal_error_ratio: float
     better_share: float
     comparison: ModelComparison
     diagnostics: tuple[Diagnostic, ...]
@@ -122,7 +122,9 @@ class Verification:
             "accepted": self.accepted,
             "verdict": self.verdict,
             "sentence": self.sentence,
-            "ratio": None if np.isnan(self.ratio) else self.ratio,
+            "ratio": None
+            if np.isnan(self.corrected_to_nominal_error_ratio)
+            else self.corrected_to_nominal_error_ratio,
             "better_share": self.better_share,
             **self.comparison.to_json(),
             "diagnostics": [one.model_dump() for one in self.diagnostics],
@@ -201,7 +203,7 @@ def verify(
         settings=settings,
         verdict=verdict,
         sentence=sentence,
-        ratio=ratio,
+        corrected_to_nominal_error_ratio=ratio,
         better_share=difference.better_share,
         comparison=comparison,
         diagnostics=wrong,

@@ -36,7 +36,7 @@ class Lens:
     file: Annotated[str, FILE]
     sheet: Annotated[str, FILE]
     width: Annotated[float, Option("--width-mm", unit="mm")] = 1e-3
-    depth: Annotated[float, Option("--depth-mm", unit="mm", min=0, is_key=True)] = 2e-3
+    depth: Annotated[float, Option("--depth-mm", unit="mm", min=0, is_key_only=True)] = 2e-3
 
 
 @dataclass(frozen=True)

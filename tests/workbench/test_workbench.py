@@ -117,7 +117,7 @@ def test_what_was_dragged_is_written_and_can_be_undone(browser_with_link, bench,
     assert state(browser_with_link)["dragged"] == {"turn": 0, "values": {}}
     digest = seen(browser_with_link)
     refused = ended(browser_with_link, bench, "cell", seen=digest, **fields)
-    assert refused.field == "surroundings.tracker.x_mm"
+    assert refused.refused_field == "surroundings.tracker.x_mm"
     margin = {"surroundings.joints.margin_deg": "1000"}  # leaves no range of the joints
     assert ended(browser_with_link, bench, "cell", seen=digest, **margin).refusal
     assert cell.file.path.read_text() == text
@@ -243,7 +243,9 @@ def test_warnings_point_at_their_rows_by_fields(browser_with_link, bench, cell, 
         kind="mixed_rows", severity="warning", sentence="rows differ", rows=("a.csv, line 3", "a.csv, line 4")
     )
     text = ResultText(Verdict("exact", "yes", "none"), (one.sentence,))
-    monkeypatch.setitem(STEPS, "calibrate", lambda *_: Outcome(text, rows=wrong_rows_by_sentence([one])))
+    monkeypatch.setitem(
+        STEPS, "calibrate", lambda *_: Outcome(text, wrong_rows_by_sentence=wrong_rows_by_sentence([one]))
+    )
     ended(browser_with_link, bench, "calibrate")
     assert 'data-show="a.csv, line 3; a.csv, line 4"' in browser_with_link.ask("/tab/calibrate").body.decode()
     bench.jobs.outcomes.pop("calibrate")

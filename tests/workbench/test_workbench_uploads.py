@@ -52,7 +52,7 @@ def test_an_upload_is_shown_and_added_as_the_command_would(browser_with_link, be
     shown = browser_with_link.ask("/propose", "POST", json.dumps({"files": number})).body.decode()
     assert "<b>rows.csv</b>" in shown
     found = ended(browser_with_link, bench, "import", files=number, date=day(3))
-    assert found.person == "Ada"
+    assert found.started_by == "Ada"
     entry = Cell.open(cell.folder).history.sessions()[-1]
     assert (entry.name, entry.rows) == (day(3), 12)
     assert (cell.folder / "sessions" / f"{day(3)}.csv").read_bytes() == (tmp_path / "rows.csv").read_bytes()

@@ -29,7 +29,7 @@ def planned(settings: PlanSettings) -> Plan:
 def test_every_planned_pose_sees_the_board(planned: Plan, settings: PlanSettings):
     arm, camera = planned.stored_plan.arm, settings.camera
     assert camera is not None
-    assert planned.poses + planned.check_poses == len(planned.stored_plan.q) >= 14
+    assert planned.calibration_pose_count + planned.test_pose_count == len(planned.stored_plan.q) >= 14
     radius = arm.capsules.radius.numpy()
     assert all(sees_board(arm, camera, q, radius) for q in planned.stored_plan.q.numpy())
     assert bool(arm.faults(planned.stored_plan.q).allowed.all())

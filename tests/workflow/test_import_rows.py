@@ -58,7 +58,7 @@ def write(tmp_path: Path, *texts: str) -> list[Path]:
 def test_rows_without_a_measurement_are_left_out_and_named(tmp_path: Path):
     paths = write(tmp_path, f"{HEADER}\np1,1,2,3,4,5\np2,1,3,,,\np3,1,4,NaN,---,-\np4,1,5,6,7,8\n")
     rows = import_rows(paths)
-    assert rows.rows == 2
+    assert rows.row_count == 2
     assert [row.line for row in rows.measurement_table.left_out] == [3, 4]
     assert rows.to_json()["left_out"] == [
         {"file": str(paths[0]), "line": line, "reason": "nothing was measured"} for line in (3, 4)

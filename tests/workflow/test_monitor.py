@@ -28,8 +28,8 @@ def dated(rows, *dates):
 def test_rows_of_several_days_are_several_sessions():
     rows = dated(rows_after_change(12, 30), "2026-02-01", "2026-01-01")
     monitoring = monitor(original_model(), [rows, dated(rows_after_change(6, 31), "2026-03-01")])
-    assert [one.date for one in monitoring.sessions] == ["2026-01-01", "2026-02-01", "2026-03-01"]
-    assert [one.session.rows for one in monitoring.sessions] == [6, 6, 6]
+    assert [one.date for one in monitoring.sessions_of_call] == ["2026-01-01", "2026-02-01", "2026-03-01"]
+    assert [one.session.rows for one in monitoring.sessions_of_call] == [6, 6, 6]
     assert not monitoring.needs_action
     assert [chart.quantity for chart in monitoring.charts][-2:] == ["joint 6", "error"]
 
@@ -38,7 +38,7 @@ def test_an_instrument_that_was_moved_raises_no_alarm():
     monitoring = monitor(
         original_model(), [rows_after_change(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))]
     )
-    assert [one.what for one in monitoring.sessions[0].session.movements] == ["base", "base"]
+    assert [one.what for one in monitoring.sessions_of_call[0].session.movements] == ["base", "base"]
     assert monitoring.sentences == ()
     assert not monitoring.needs_action
 
@@ -91,13 +91,13 @@ def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
     (folder := tmp_path / "model").mkdir()
     save_model(original_model(), folder)
     monitoring = monitor(folder, [rows, metres])
-    assert (len(monitoring.sessions), len(monitoring.records)) == (1, 1)
+    assert (len(monitoring.sessions_of_call), len(monitoring.all_sessions)) == (1, 1)
     (untrusted,) = monitoring.untrusted_sessions
     assert [one.kind for one in untrusted.diagnostics] == ["setup_fault"]
     assert monitoring.needs_action
-    assert len(monitor(folder, [metres]).records) == 1
+    assert len(monitor(folder, [metres]).all_sessions) == 1
     alone = monitor(original_model(), [metres])
-    assert (alone.records, alone.charts, alone.trends) == ((), (), ())
+    assert (alone.all_sessions, alone.charts, alone.trends) == ((), (), ())
     alone.save_page(tmp_path / "page.html")
     (left_out,) = alone.untrusted_sessions
     assert html.escape(left_out.diagnostics[0].sentence) in (tmp_path / "page.html").read_text()
@@ -111,15 +111,15 @@ def test_the_same_rows_again_are_not_a_new_session(tmp_path):
         rows.select(torch.arange(9, -1, -1)), position=(rows.position.flip(0) * 1e5).round() / 1e5
     )
     both = monitor(folder, [dated(rows, "2026-01-01"), dated(again, "2026-02-01")])
-    assert [one.date for one in both.records] == ["2026-01-01"]
+    assert [one.date for one in both.all_sessions] == ["2026-01-01"]
     assert len(both.warnings) == 1
     with refused(MeasurementError, expected="new rows"):
         monitor(folder, [dated(again.select(torch.arange(6)), "2026-03-01")])
     corrected = monitor(folder, [rows], MonitorSettings(dates=("2026-01-05",)))
-    assert [one.date for one in corrected.records] == ["2026-01-05"]
+    assert [one.date for one in corrected.all_sessions] == ["2026-01-05"]
     assert len(corrected.warnings) == 1
     mixed = monitor(original_model(), [rows, join([rows_after_change(8, 31), again])])
-    assert sorted(one.session.rows for one in mixed.sessions) == [8, 10]
+    assert sorted(one.session.rows for one in mixed.sessions_of_call) == [8, 10]
 
 
 def test_rows_of_the_calibration_are_not_a_session():
@@ -127,4 +127,4 @@ def test_rows_of_the_calibration_are_not_a_session():
     with refused(MeasurementError, expected="new rows"):
         monitor(original_model(), [own])
     mixed = monitor(original_model(), [join([own.select(torch.arange(3)), rows_after_change(10, 30)])])
-    assert [one.session.rows for one in mixed.sessions] == [10]
+    assert [one.session.rows for one in mixed.sessions_of_call] == [10]

@@ -30,7 +30,7 @@ def test_monitor_uses_the_other_rows(base):
         done = monitor(original_model(), [with_one_far_off(rows)])
         alone = monitor(original_model(), [rows])
     assert done.untrusted_sessions == ()
-    (session,), (right,) = (one.sessions for one in (done, alone))
+    (session,), (right,) = (one.sessions_of_call for one in (done, alone))
     assert session.session.rows == 15
     assert session.session.verdict == right.session.verdict
     assert abs(session.session.rms - right.session.rms) < 5e-5

@@ -100,7 +100,7 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     with no_type_checker():
         more = plan("fanuc_r2000", settings, CELL)
     assert [point.poses for point in more.accuracy_curve] == [0, 2]
-    assert more.check_poses == 0
+    assert more.test_pose_count == 0
 
 
 @pytest.mark.parametrize(

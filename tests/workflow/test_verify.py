@@ -68,7 +68,7 @@ def test_good_data_are_explained_better_without_faults(geometric):
     assert found.verdict == "better"
     assert found.setup_faults == ()
     assert found.warnings == ()
-    assert found.ratio < 0.3
+    assert found.corrected_to_nominal_error_ratio < 0.3
     assert found.better_share > 0.9
 
 
@@ -173,7 +173,7 @@ def test_measured_ur5(shared_data):
     good = verify(model, rows)
     assert good.verdict == "better"
     assert good.setup_faults == ()
-    assert good.ratio < 0.25
+    assert good.corrected_to_nominal_error_ratio < 0.25
     (setup_fault,) = verify(model, joints(rows, [1, 1, 1, 1, -1.0, 1])).setup_faults
     assert (setup_fault.kinds, setup_fault.joints) == (("joint_sign",), (4,))
     assert setup_fault.rms_after < 2e-4

@@ -100,8 +100,8 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
     distances = {what: one.errors.figures for what, one in compared.displacements.items()}
     short, whole = (
         ([], [])
-        if compared.rows is None
-        else comparison_blocks(compared.rows, "the rows", screen_width(), verbose)
+        if compared.row_comparison is None
+        else comparison_blocks(compared.row_comparison, "the rows", screen_width(), verbose)
     )
     head, rows = pose_rows(distances)
     blocks = [
@@ -117,7 +117,7 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
 def _verdict(compared: "ComparedModels") -> Verdict:
     """Return the verdict: how much two models differ, and which is better."""
     first, second = compared.models
-    errors = compared.workspace.errors.figures.figures_by_name
+    errors = compared.workspace_displacement.errors.figures.figures_by_name
     count, better = len(compared.parameters.differing), compared.better_model
     which = (
         f"the arms differ in {count_text(count, 'parameter')}"
@@ -126,7 +126,7 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     )
     if compared.diagnostics:
         trust = f"no: {compared.diagnostics[0].sentence}"
-    elif compared.rows is None:
+    elif compared.row_comparison is None:
         trust = f"{which}; which model is better is not known without --rows."
     else:
         trust = f"{which}; {f'{better} predicts' if better else 'neither clearly predicts'} the rows better."
@@ -135,7 +135,7 @@ def _verdict(compared: "ComparedModels") -> Verdict:
         f"places it, {rounded_text(errors['max_mm'])} mm at most.",
         trust,
         "measure rows and compare again with --rows."
-        if compared.rows is None
+        if compared.row_comparison is None
         else "correct the problem named above."
         if compared.diagnostics
         else f"use {better}."

@@ -73,6 +73,8 @@ class ServeSettings:
     client_timeout: Annotated[float, HIDDEN] = _CLIENT_TIMEOUT
     rsi: Path | None = None
     rsi_max_correction: Annotated[
-        float, Option("--rsi-max-correction-deg", unit="deg", min=0, max=5, is_key=True)
+        float, Option("--rsi-max-correction-deg", unit="deg", min=0, max=5, is_key_only=True)
     ] = math.radians(1.0)
-    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key=True)] = POLL_DURATION
+    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key_only=True)] = (
+        POLL_DURATION
+    )

@@ -22,8 +22,8 @@ class Repeatability:
         angle: repeatability of the robot's orientation in images: standard deviation per axis [rad].
     """
 
-    length: Annotated[float, Option("--repeatability-mm", unit="mm", is_key=True)] = 2e-5
-    angle: Annotated[float, Option("--repeatability-deg", unit="deg", is_key=True)] = math.radians(0.01)
+    length: Annotated[float, Option("--repeatability-mm", unit="mm", is_key_only=True)] = 2e-5
+    angle: Annotated[float, Option("--repeatability-deg", unit="deg", is_key_only=True)] = math.radians(0.01)
 
     def __post_init__(self) -> None:
         """Check both standard deviations."""

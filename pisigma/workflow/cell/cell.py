@@ -158,7 +158,7 @@ class Cell:
         with self.history.database.transaction():  # reserved, so that no other process chooses the same name
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
-        made = f"plan '{path.stem}' of {planned.poses + planned.check_poses} poses"
+        made = f"plan '{path.stem}' of {planned.calibration_pose_count + planned.test_pose_count} poses"
         of = "" if entry is None else entry.name
         self.history.add(Check("plan", of, "", "planned", made, None, False, now()))
         return planned, path
@@ -205,7 +205,7 @@ class Cell:
         result = calibrate_rows(
             self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
         )
-        result = with_warnings(result, (*warnings, *self.file.row_warnings()))
+        result = with_warnings(result, (*warnings, *self.file.measured_joints_warnings()))
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
             refused = ("calibrate", "", "", "not_trusted", doubt)
@@ -215,7 +215,7 @@ class Cell:
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
         path = self._saved(result, accept_implausible)
-        p95, rms = result.position_errors_mm
+        p95, rms = result.held_out_p95_and_best_known_rms_mm
         entry = model_entry(events, started, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, started, rms, stated)
@@ -322,7 +322,7 @@ class Cell:
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
-        found = (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
+        found = (*self.controller_warnings("recalibrate", parent), *self.file.measured_joints_warnings())
         result = with_warnings(result, found)
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
@@ -330,7 +330,7 @@ class Cell:
             self.history.add(Check(*refused, None, False, now()))
             return result, None
         path = self._saved(result, accept_implausible)
-        remark, (p95, rms) = result.summary.verdict, result.position_errors_mm
+        remark, (p95, rms) = result.summary.verdict, result.held_out_p95_and_best_known_rms_mm
         entry = model_entry((), started, path, [chosen], remark, result, parent)
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept_candidate, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]

@@ -239,7 +239,7 @@ class CellFile:
             frozenset(changed),
         )
 
-    def row_warnings(self) -> tuple[str, ...]:
+    def measured_joints_warnings(self) -> tuple[str, ...]:
         """Return warnings about models that are fitted to the rows of the cell."""
         return (MEASURED_JOINTS,) if self.document.joint_values == "measured" else ()
 

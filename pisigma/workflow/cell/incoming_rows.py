@@ -89,7 +89,7 @@ class IncomingRows:
         return propose_import(self.files, self.settings)
 
     @cached_property
-    def is_ready(self) -> bool:
+    def needs_no_conversion(self) -> bool:
         """Whether the files are a single measurement file, which needs no conversion."""
         stated = self.settings.maps or self.settings.new_frame_at
         return len(self.files) == 1 and not stated and is_measurement_file(self.files[0])
@@ -101,7 +101,7 @@ class IncomingRows:
         Raises:
             MeasurementError: see `import_rows`.
         """
-        return None if self.is_ready else import_rows(self.proposal)
+        return None if self.needs_no_conversion else import_rows(self.proposal)
 
     @cached_property
     def unchecked_rows(self) -> Measurements:
@@ -148,7 +148,7 @@ class IncomingRows:
             )
             corrected.findings = refusal.findings
             raise corrected from refusal
-        self.cell.sessions.set_imported_aside([] if self.is_ready else self.files, entry)
+        self.cell.sessions.set_imported_aside([] if self.needs_no_conversion else self.files, entry)
         return entry
 
     def repair(self, finding: Diagnostic) -> Repair | None:

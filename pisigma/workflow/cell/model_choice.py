@@ -141,7 +141,7 @@ def monitoring_check_entry(
     check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
     if monitoring.untrusted_sessions:
         return replace(check, summary=monitoring.untrusted_sessions[0].sentence)
-    judged = monitoring.sessions[-1].session
+    judged = monitoring.sessions_of_call[-1].session
     check = replace(check, verdict=judged.verdict, summary=judged.sentence, rms_mm=judged.rms * 1e3)
     if judged.recalibrate or judged.verdict == "moved":
         return replace(check, recalibrate=True)
@@ -190,7 +190,7 @@ def calibrate_rows(
     """
     if prior is None:
         result = calibrate(robot, rows, replace(settings, cameras=None), progress)
-        return replace(result, has_figures=result.summary.validation_errors is not None)
+        return replace(result, has_drawn_figures=result.summary.validation_errors is not None)
     settings.check_unused(WITH_PRIOR)
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 
@@ -224,7 +224,7 @@ def model_entry(
         day=day,
         frame_day=newest_day(events, "instrument", day),
         target_day=newest_day(events, "tool", day),
-        p95_mm=result.position_errors_mm[0],
+        p95_mm=result.held_out_p95_and_best_known_rms_mm[0],
         remark=remark,
         scatter_mm=identified_noise_sigma_mm(result.summary) if isinstance(result, Calibration) else None,
         has_posterior=result.model.uncertainty is not None,

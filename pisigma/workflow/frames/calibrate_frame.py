@@ -57,7 +57,7 @@ class FrameCalibration(AbstractModelResult):
         return self.summary.warnings
 
     @property
-    def position_errors_mm(self) -> tuple[float | None, float | None]:
+    def held_out_p95_and_best_known_rms_mm(self) -> tuple[float | None, float | None]:
         """Return None and the RMS of the position errors of the rows [mm]; see `AbstractModelResult`."""
         return None, self.summary.rms_mm
 

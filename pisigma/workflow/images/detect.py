@@ -36,12 +36,12 @@ class JoinedJoints:
 
     Attributes:
         columns: columns of the log that are kept, such as "q1_deg" and "payload_kg".
-        cells: texts of these columns by image name; images without joint values are omitted.
+        texts_by_image: texts of these columns by image name; images without joint values are omitted.
         remarks: sentences about rows without an image, and warnings.
     """
 
     columns: tuple[str, ...]
-    cells: Mapping[str, tuple[str, ...]]
+    texts_by_image: Mapping[str, tuple[str, ...]]
     remarks: tuple[str, ...]
 
 
@@ -65,7 +65,7 @@ class DetectedCorners:
         columns = () if self.joints is None else self.joints.columns
         rows = [["image", "camera", "board", "corner", "u_px", "v_px", *columns]]
         for name, board in self.detection.boards.items():
-            cells = () if self.joints is None else self.joints.cells.get(name)
+            cells = () if self.joints is None else self.joints.texts_by_image.get(name)
             if cells is not None:
                 pairs = zip(board.corner_numbers.tolist(), board.pixels.tolist(), strict=True)
                 rows += [

@@ -33,14 +33,14 @@ class RecipeData:
         test: rows of the set "test" of measured data; None if there are none.
         simulations: training and held-out rows of every repeat of a simulation, beginning with rows of the model;
             empty for measured data.
-        folds: how measured rows are split for a cross-validation; None for simulated data.
+        fold_settings: how measured rows are split for a cross-validation; None for simulated data.
     """
 
     robot: Robot
     training: Measurements
     test: Measurements | None = None
     simulations: tuple[tuple[Measurements, Measurements], ...] = ()
-    folds: MeasuredData | None = None
+    fold_settings: MeasuredData | None = None
 
     @property
     def held_out(self) -> Measurements | None:
@@ -53,8 +53,8 @@ class RecipeData:
         Raises:
             MeasurementError: there are fewer different joint vectors than folds.
         """
-        if self.folds is not None:
-            return self.training, k_folds(self.training, self.folds.folds, self.folds.seed)
+        if self.fold_settings is not None:
+            return self.training, k_folds(self.training, self.fold_settings.folds, self.fold_settings.seed)
         every = [rows for pair in self.simulations for rows in pair]
         joined = join(every)
         numbers = iter(torch.split(torch.arange(joined.rows), [rows.rows for rows in every]))
@@ -89,7 +89,7 @@ def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None
             remedy="give the file with --data FILE.csv",
         )
     robot = Robot.load(recipe.robot)
-    return RecipeData(robot, *read_rows(data, robot).split_sets(), folds=recipe.data)
+    return RecipeData(robot, *read_rows(data, robot).split_sets(), fold_settings=recipe.data)
 
 
 def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:

@@ -85,7 +85,7 @@ SocketDistances = Annotated[
         metavar="A,B,MM",
         help="Known distance between two sockets [mm], such as */0,*/1,50. An asterisk stands for the same text in "
         "both names, here for every placement.",
-        is_key=True,
+        is_key_only=True,
     ),
 ]
 
@@ -131,25 +131,25 @@ class CalibrationSettings:
     folds: Annotated[int | None, Option(min=0)] = None
     hold_out: Annotated[float | None, KEY] = None
     split: "SplitBy" = "joints"
-    repeats: Annotated[int | None, Option(min=1, is_key=True)] = None
+    repeats: Annotated[int | None, Option(min=1, is_key_only=True)] = None
     jobs: int | None = None
     seed: Annotated[int, KEY] = 0
     train_rows: Annotated[int | None, KEY] = None
     free: Annotated[
         Literal["identifiable", "joint_offsets"] | tuple[str, ...],
-        Option(kind=str, read=parse_free_parameters, is_key=True),
+        Option(kind=str, read=parse_free_parameters, is_key_only=True),
     ] = "identifiable"
-    prior_length: Annotated[float, Option("--prior-mm", unit="mm", is_key=True)] = 1e-3
-    prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad", is_key=True)] = 1e-3
-    robot_class: Annotated["ClassName | None", Option("--class", kind=str, is_key=True)] = None
+    prior_length: Annotated[float, Option("--prior-mm", unit="mm", is_key_only=True)] = 1e-3
+    prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad", is_key_only=True)] = 1e-3
+    robot_class: Annotated["ClassName | None", Option("--class", kind=str, is_key_only=True)] = None
     robust: Annotated[bool, KEY] = True
-    features: Annotated[tuple[str, ...] | None, Option(kind=str, read=split_names, is_key=True)] = None
+    features: Annotated[tuple[str, ...] | None, Option(kind=str, read=split_names, is_key_only=True)] = None
     gravity: Annotated[
-        tuple[float, float, float] | None, Option(kind=str, read=parse_direction, is_key=True)
+        tuple[float, float, float] | None, Option(kind=str, read=parse_direction, is_key_only=True)
     ] = None
-    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
+    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key_only=True)] = ()
     socket_distances: SocketDistances = field(default_factory=dict)
-    socket_sigma: Annotated[float, Option("--socket-sigma-mm", unit="mm", is_key=True)] = 1e-5
+    socket_sigma: Annotated[float, Option("--socket-sigma-mm", unit="mm", is_key_only=True)] = 1e-5
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pisigma.files.setting import KEY, Option
 
-MaxBlur = Annotated[float, Option("--max-blur-px", min=0.0, is_key=True)]
+MaxBlur = Annotated[float, Option("--max-blur-px", min=0.0, is_key_only=True)]
 
 
 @dataclass(frozen=True)
@@ -35,5 +35,5 @@ class IntrinsicsSettings:
     """
 
     name: str = "camera"
-    free_k3: Annotated[bool, Option("--k3", is_key=True)] = False
+    free_k3: Annotated[bool, Option("--k3", is_key_only=True)] = False
     max_blur: MaxBlur = 3.0

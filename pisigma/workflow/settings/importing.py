@@ -61,14 +61,14 @@ class ImportSettings:
     units: Annotated[str, Option("--unit")] = ""
     rotation: str | None = None
     decimal: Annotated[
-        "Decimal | None", Option(kind=Literal["point", "comma"], read=_SIGNS.get, is_key=True)
+        "Decimal | None", Option(kind=Literal["point", "comma"], read=_SIGNS.get, is_key_only=True)
     ] = None
     join: Annotated["JoinBy | None", Option(kind=str)] = None
     within: Annotated[float, Option(kind=str, read=parse_seconds, default="0.2s")] = 0.2
-    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
-    lerobot_units: Annotated["LeRobotUnits | None", Option(kind=str, is_key=True)] = None
-    lerobot_calibration: Annotated[str | None, Option(is_key=True)] = None
-    lerobot_prefix: Annotated[str, Option(is_key=True)] = ""
+    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key_only=True)] = ()
+    lerobot_units: Annotated["LeRobotUnits | None", Option(kind=str, is_key_only=True)] = None
+    lerobot_calibration: Annotated[str | None, Option(is_key_only=True)] = None
+    lerobot_prefix: Annotated[str, Option(is_key_only=True)] = ""
 
     def __post_init__(self) -> None:
         """Check the choices."""

@@ -54,7 +54,9 @@ def as_written_before(model, folder):
 def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
     rows = rows_with(KINDS[of_rows], 12, 3, zero=MOVED_DEG)
     with no_type_checker():
-        session = monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions[-1].session
+        session = (
+            monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions_of_call[-1].session
+        )
         recalibrated = recalibrate(models[of_model], rows)
     assert [one.what for one in session.movements] == ["joint 3"]
     assert all(session.observable)
@@ -71,7 +73,9 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
 def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
     rows = rows_with(KINDS[of_rows], 12, 5)
     with no_type_checker():
-        session = monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions[-1].session
+        session = (
+            monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions_of_call[-1].session
+        )
     assert session.verdict == "unchanged"
     assert all(session.observable)
 
@@ -93,7 +97,7 @@ def test_rows_without_standard_deviations_are_refused_where_an_older_folder_has_
     older = as_written_before(models["stated"], tmp_path)
     stated = rows_with(SIGMA, 12, 3, zero=MOVED_DEG)
     with no_type_checker():
-        session = monitor(older, [stated], MonitorSettings(history=False)).sessions[-1].session
+        session = monitor(older, [stated], MonitorSettings(history=False)).sessions_of_call[-1].session
         assert [one.what for one in session.movements] == ["joint 3"]
         for judge in (
             lambda rows: monitor(older, [rows], MonitorSettings(history=False)),
@@ -108,7 +112,7 @@ def test_an_older_folder_with_a_standard_deviation_takes_rows_of_both_kinds(mode
     for sigma in KINDS.values():
         rows = rows_with(sigma, 12, 3, zero=MOVED_DEG)
         with no_type_checker():
-            session = monitor(older, [rows], MonitorSettings(history=False)).sessions[-1].session
+            session = monitor(older, [rows], MonitorSettings(history=False)).sessions_of_call[-1].session
         assert [one.what for one in session.movements] == ["joint 3"]
 
 

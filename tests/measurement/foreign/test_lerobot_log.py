@@ -26,7 +26,7 @@ def test_the_joints_of_every_frame_are_found_by_the_name_of_its_image(layout, tm
     log.save(tmp_path / "joints.csv")
     images = [f"episode-{episode:06d}-frame-{frame:06d}" for episode in range(2) for frame in range(6)]
     joined = join_joint_values(images, tmp_path / "joints.csv", max_time_difference=0.2)
-    values = np.array([joined.cells[image] for image in images], dtype=float)
+    values = np.array([joined.texts_by_image[image] for image in images], dtype=float)
     assert_close(values, recorded(layout)[:, :5] * 4095 / 4096, atol=1e-6)
 
 

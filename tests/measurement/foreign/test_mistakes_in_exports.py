@@ -211,7 +211,7 @@ def test_summaries_are_left_out_and_listed(tmp_path: Path, case: str):
     names, change, lines = SUMMARIES[case]
     result = imported(tmp_path, change(measured()), names)
     assert [row.line for row in result.left_out] == lines
-    assert result.rows == 12
+    assert result.row_count == 12
     assert "line" in " ".join(result.sentences)
 
 
@@ -221,7 +221,7 @@ def test_a_commanded_centre_is_not_a_mean(tmp_path: Path):
         ["0.0"] * 9,
         *([f"{sign * (10 + i + k)}.0" for k in range(9)] for i in range(3) for sign in (1, -1)),
     ]
-    assert imported(tmp_path, rows, NAMES).rows == 7
+    assert imported(tmp_path, rows, NAMES).row_count == 7
 
 
 def test_unambiguous_dates_are_read_in_any_order(tmp_path: Path):
@@ -235,7 +235,7 @@ def test_unambiguous_dates_are_read_in_any_order(tmp_path: Path):
 
 def test_measurements_named_like_a_statistic_in_every_row_are_kept(tmp_path: Path):
     rows = [[*row, "mean"] for row in measured()]
-    assert imported(tmp_path, rows, [*NAMES, "mode"]).rows == 12
+    assert imported(tmp_path, rows, [*NAMES, "mode"]).row_count == 12
 
 
 def test_lines_of_numbers_around_the_table_are_listed(tmp_path: Path):
@@ -271,7 +271,7 @@ def test_a_stated_first_column_does_not_change_the_order_of_others(tmp_path: Pat
 
 def test_a_joint_that_moves_in_steps_is_not_a_time(tmp_path: Path):
     rows = [[str(-10 * (i // 8)), *row[1:]] for i, row in enumerate(measured(40))]
-    assert imported(tmp_path, rows, None).rows == 40
+    assert imported(tmp_path, rows, None).row_count == 40
 
 
 def test_a_file_that_is_given_twice_is_refused(tmp_path: Path):

@@ -73,7 +73,7 @@ def test_the_first_model_is_put_into_use_when_it_is_verified(year):
 def test_a_move_is_found_and_recalibrated(year):
     cell, *_ = year
     found = cell.monitor()
-    assert [one["what"] for one in found.sessions[-1].to_json()["moved"]] == ["joint 3"]
+    assert [one["what"] for one in found.sessions_of_call[-1].to_json()["moved"]] == ["joint 3"]
     assert cell.status().step.state == "moved"
     assert [one.day for one in cell.history.monitored_sessions()] == [day(30), day(2)]
     assert not list((cell.folder / "models").glob("*.sqlite"))
@@ -105,7 +105,7 @@ def test_rows_that_improve_the_model_are_used_without_a_move_and_a_moved_tracker
 def test_a_plan_for_a_model_has_few_and_other_poses_and_is_measured_next(year):
     cell, *_ = year
     planned, path = cell.plan(candidates=200)
-    assert (planned.poses, planned.check_poses) == (10, 0)
+    assert (planned.calibration_pose_count, planned.test_pose_count) == (10, 0)
     assert cell.status().step.state in ("up_to_date", "session_not_judged")  # no plan was due
     settings = cell.file.plan_settings(cell.status().facts, count=12)
     assert (settings.count, settings.check, settings.seed) == (12, 0, 2)

@@ -20,7 +20,7 @@ def test_by_name_with_or_without_extension(tmp_path: Path) -> None:
     )
     joined = join_joint_values(["0001", "0002", "0003"], path, 0.2)
     assert joined.columns == ("q1_deg", "q2_deg", "payload_kg")
-    assert joined.cells == {"0001": ("1.5", "2", "3"), "0002": ("4.25", "5", "3")}
+    assert joined.texts_by_image == {"0001": ("1.5", "2", "3"), "0002": ("4.25", "5", "3")}
     assert "line 3 (0003)" in joined.remarks[0]
     assert "line 4 (0009)" in joined.remarks[1]
     assert "note" in joined.remarks[2]
@@ -29,7 +29,7 @@ def test_by_name_with_or_without_extension(tmp_path: Path) -> None:
 def test_by_time_in_seconds_and_nanoseconds(tmp_path: Path) -> None:
     path = log(tmp_path, "time,q1_deg\n1700000000.0,1\n1700000001.0,2\n1700000005.0,3\n")
     joined = join_joint_values(["1700000001100000000", "1700000005.05", "1700000003.0"], path, 0.2)
-    assert joined.cells == {"1700000001100000000": ("2",), "1700000005.05": ("3",)}
+    assert joined.texts_by_image == {"1700000001100000000": ("2",), "1700000005.05": ("3",)}
 
 
 @pytest.mark.parametrize(

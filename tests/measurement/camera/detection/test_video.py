@@ -80,7 +80,7 @@ def test_stops_are_paired_only_if_every_row_is_one(video, tmp_path):
     log = tmp_path / "joints.csv"
     log.write_text("image,q1_deg\n1,10\n2,20\n3,30\n")
     names = [file.stem for file in image_files([video])]
-    assert join_joint_values(names, log, 0.2, len(names)).cells == {
+    assert join_joint_values(names, log, 0.2, len(names)).texts_by_image == {
         "0001": ("10",),
         "0002": ("20",),
         "0003": ("30",),
