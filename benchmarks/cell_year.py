@@ -90,7 +90,7 @@ class Year:
         entry = self.cell.add_session(rows, day=self.days[month])
         self.since.append(entry.day)
         self.wrong_steps += self.cell.status().step.state != "session_not_judged"
-        found = self.cell.monitor().sessions[-1]
+        found = self.cell.monitor().sessions_of_call[-1]
         named = {one["what"] for one in found.to_json()["moved"]}
         others = [self.error(before)]
         others += [self.error(recalibrate(before, self.cell.sessions.rows_of_file(entry)).model)]

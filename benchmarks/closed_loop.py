@@ -192,7 +192,7 @@ def close_loop(
     """Measure the planned poses, calibrate, verify, and compare the positions attained at `count` other poses."""
     began = time.perf_counter()
     loop = Loop(arm, case, seed, folder)
-    planned, check = plan.stored_plan.q.numpy(), plan.stored_plan.check.numpy()
+    planned, check = plan.stored_plan.q.numpy(), plan.stored_plan.is_test_pose.numpy()
     rows = loop.measure(planned[~check], "calibration")
     calibration, entry = loop.cell.calibrate(accept_implausible=True, folds=0)
     assert entry is not None

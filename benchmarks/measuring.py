@@ -116,8 +116,8 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
             few,
             arm=ArmInSurroundings.from_robot(arm.planned),
             q=q,
-            check=torch.zeros(count, dtype=torch.bool),
-            candidate=torch.arange(count),
+            is_test_pose=torch.zeros(count, dtype=torch.bool),
+            candidate_number=torch.arange(count),
             waypoints=(q[:0],) * count,
         )
     rule = MeasureSettings(limit_mm=LIMIT_MM, least_gain_mm=0.0, replan=how == "planned")

@@ -103,7 +103,7 @@ def _alarmed(monitoring: pisigma.MonitoringResult) -> list[bool]:
     outside = torch.stack(
         [one for chart in monitoring.charts for one in chart.sessions_outside.values()]
     ).any(0)
-    moved = [one.session.verdict != "unchanged" for one in monitoring.sessions]
+    moved = [one.session.verdict != "unchanged" for one in monitoring.sessions_of_call]
     return [one or other for one, other in zip(outside.tolist(), moved, strict=True)]
 
 

@@ -88,7 +88,7 @@ class Bench:
             for name in ("geometric", "hybrid")
         }
         camera, board = views.sight.camera, views.sight.board
-        return Bench(arm, settings, drawn.q, drawn.workspace[:TASK_POSES], posterior, camera, board)
+        return Bench(arm, settings, drawn.q, drawn.workspace_q[:TASK_POSES], posterior, camera, board)
 
     def figures(self, draw: int, q: Tensor, judged: Tensor) -> tuple[float, float]:
         """Return true and predicted error [mm] of a calibration of one true arm with images at joint values."""

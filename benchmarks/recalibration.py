@@ -98,7 +98,7 @@ def planned() -> None:
         rows.write_csv(candidates, Robot.load("ur10"))
         for count, asked in ASKED_OF_PLAN.items():
             settings = PlanSettings(count, check=0, candidates_from=str(candidates))
-            chosen = plan(model_of("B"), settings).stored_plan.candidate.numpy() - 1
+            chosen = plan(model_of("B"), settings).stored_plan.candidate_number.numpy() - 1
             few, others = (
                 rows.select(torch.from_numpy(one)) for one in (chosen, np.setdiff1d(every, chosen))
             )

@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from pisigma import CalibrationSettings, Robot, calibrate, recalibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_offset import JointOffset
 
@@ -22,7 +22,7 @@ def measure(true, count, seed):
         "sensor": "position",
         "noise": {"position_mm": 0.03, "seed": seed},
     }
-    return SimulatedMeasurements.model_validate(section).measure(true)
+    return SimulatedTracker.model_validate(section).measure(true)
 
 
 model = calibrate(robot, measure(before, 80, 1), CalibrationSettings(folds=0)).model

@@ -5,7 +5,7 @@ import shutil
 from matplotlib.figure import Figure
 
 from pisigma import Cell, Robot, estimate_fleet_prior, recalibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 
 robot = Robot.load("rb5")
@@ -26,7 +26,7 @@ def measure(number, count, seed):
         "noise": {"position_mm": 0.03, "seed": seed},
     }
     true = TrueRobot(robot, [errors(1.0, 0), errors(0.2, number)])
-    return SimulatedMeasurements.model_validate(section).measure(true)
+    return SimulatedTracker.model_validate(section).measure(true)
 
 
 shutil.rmtree("cells", ignore_errors=True)

@@ -6,7 +6,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from pisigma import CalibrationSettings, Robot, calibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
 
 source = {"maker": "Universal Robots", "source": "Nominal values of the maker, on a rail."}
@@ -41,7 +41,7 @@ def measure(count, seed):
         "sensor": "position",
         "noise": {"position_mm": 0.05, "seed": seed},
     }
-    return SimulatedMeasurements.model_validate(section).measure(true)
+    return SimulatedTracker.model_validate(section).measure(true)
 
 
 calibration = calibrate(robot, measure(80, 1), CalibrationSettings(model="geometric", folds=0))

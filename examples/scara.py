@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from pisigma import CalibrationSettings, Robot, calibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 
 robot = Robot.load("kiro3")
@@ -19,7 +19,7 @@ def measure(count, seed):
         "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.9},
         "noise": {"position_mm": 0.02, "orientation_deg": 0.005, "seed": seed},
     }
-    return SimulatedMeasurements.model_validate(section).measure(true)
+    return SimulatedTracker.model_validate(section).measure(true)
 
 
 calibration = calibrate(robot, measure(40, 1), CalibrationSettings(model="geometric", folds=0))

@@ -5,7 +5,7 @@ import torch
 from matplotlib.figure import Figure
 
 from pisigma import CalibrationSettings, CorrectedIK, Robot, calibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 
 robot = Robot.load("panda")
@@ -17,7 +17,7 @@ section = {
     "poses": {"kind": "joints_random", "count": 80, "seed": 1, "range_fraction": 0.7},
     "noise": {"position_mm": 0.03, "orientation_deg": 0.005, "seed": 1},
 }
-rows = SimulatedMeasurements.model_validate(section).measure(true)
+rows = SimulatedTracker.model_validate(section).measure(true)
 model = calibrate(robot, rows, CalibrationSettings(model="geometric", folds=0)).model
 
 home = torch.tensor([0.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], dtype=torch.float64)

@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from pisigma import CalibrationSettings, Robot, calibrate
-from pisigma.simulation import SimulatedMeasurements, TrueRobot
+from pisigma.simulation import SimulatedTracker, TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 
 robot = Robot.load("ur10")
@@ -20,7 +20,7 @@ def measure(count, seed):
         "sensor": "position",
         "noise": {"position_mm": 0.05, "seed": seed},
     }
-    return SimulatedMeasurements.model_validate(section).measure(true)
+    return SimulatedTracker.model_validate(section).measure(true)
 
 
 calibration = calibrate(robot, measure(60, 1), CalibrationSettings(model="geometric", folds=0))

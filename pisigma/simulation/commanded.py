@@ -39,7 +39,7 @@ class BranchSection(Section):
             raise ValueError("near_mm applies only to near_deg, not to name; remove it")
         return self
 
-    def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
+    def start_joints(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
         """Return joint values [rad or m] near which the true robot reaches the desired poses.
 
         Args:
@@ -69,7 +69,7 @@ class BranchSection(Section):
             )
         return _nearest(solutions, robot, near, reached)
 
-    def find(
+    def solve_nominal(
         self, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
         """Return joint values [rad or m] of the nominal robot at poses, some of which may be unreachable.
@@ -162,7 +162,7 @@ class AbstractCommandedJoints(Section):
             return self.poses.joints(robot.nominal)
         assert self.branch is not None  # the validator has checked this
         T = self.poses.transforms()
-        return joints_for_poses(robot, T, self.branch.start(robot.nominal, T))
+        return joints_for_poses(robot, T, self.branch.start_joints(robot.nominal, T))
 
 
 def joints_for_poses(

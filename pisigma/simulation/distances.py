@@ -75,7 +75,7 @@ class SimulatedSockets(Section):
         T = transform(R, points + draws.sensor - draws.robot)
         names = [socket.name for socket in self.sockets for _ in range(self.poses_per_socket)]
         return Measurements(
-            q=joints_for_poses(robot, T, self.branch.start(robot.nominal, T)),
+            q=joints_for_poses(robot, T, self.branch.start_joints(robot.nominal, T)),
             socket=tuple(names),
             sigma_position=row_sigma(self.noise, len(points)),
             source=f"simulation of {robot.nominal.name}",

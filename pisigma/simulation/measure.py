@@ -18,7 +18,7 @@ from pisigma.simulation.touching import SimulatedTouches
 from pisigma.simulation.true_robot import TrueRobot
 
 
-class SimulatedMeasurements(AbstractCommandedJoints):
+class SimulatedTracker(AbstractCommandedJoints):
     """Section of a recipe for a tracker that measures the true robot.
 
     Attributes:
@@ -90,13 +90,13 @@ def kind(section: object) -> object:
 
 
 SimulatedPoses = Annotated[
-    Annotated[SimulatedMeasurements, Tag("tracker")] | Annotated[SimulatedImages, Tag("images")],
+    Annotated[SimulatedTracker, Tag("tracker")] | Annotated[SimulatedImages, Tag("images")],
     Discriminator(kind),
 ]
 """Section of a sensor that measures poses: a tracker (default) or images."""
 
 SimulatedSensor = Annotated[
-    SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
+    SimulatedTracker | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
     Field(discriminator="kind"),
 ]
 """Section of a sensor, distinguished by `kind`: tracker, touches, sockets, distances or pairs."""

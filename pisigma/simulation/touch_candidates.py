@@ -93,22 +93,22 @@ class TouchCandidates:
     """Touches that the nominal robot can make at the nominal placements of the jigs.
 
     Attributes:
-        placements: names of the placements, which are the frames of the touches.
+        placement_names: names of the placements, which are the frames of the touches.
         placement: index of every candidate's placement.
         face: index of every candidate's face on the jig of that placement.
         axis: index of the axis along which the candidate touches.
-        sign: +1 or -1, outward direction of the face along that axis.
-        coordinate: coordinate of the face along that axis in the frame of the jig [m].
+        outward_sign: +1 or -1, outward direction of the face along that axis.
+        face_coordinate: coordinate of the face along that axis in the frame of the jig [m].
         T_jig_tool: pose of the tool at the touch in the frame of the jig.
         q: joint values [rad or m] of the nominal robot at the touch.
     """
 
-    placements: tuple[str, ...]
+    placement_names: tuple[str, ...]
     placement: Int64[Tensor, " candidates"]
     face: Int64[Tensor, " candidates"]
     axis: Int64[Tensor, " candidates"]
-    sign: Float64[Tensor, " candidates"]
-    coordinate: Float64[Tensor, " candidates"]
+    outward_sign: Float64[Tensor, " candidates"]
+    face_coordinate: Float64[Tensor, " candidates"]
     T_jig_tool: Float64[Tensor, "candidates 4 4"]
     q: Float64[Tensor, "candidates dof"]
 
@@ -120,7 +120,7 @@ class TouchCandidates:
     @property
     def frame(self) -> tuple[str, ...]:
         """Name of the placement of every candidate."""
-        return tuple(self.placements[number] for number in self.placement.tolist())
+        return tuple(self.placement_names[number] for number in self.placement.tolist())
 
     @property
     def touch_axis(self) -> tuple[str, ...]:
@@ -135,7 +135,7 @@ class TouchCandidates:
     def concatenate(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
         """Concatenate candidates; the placements are those of the first part."""
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
-        return TouchCandidates(parts[0].placements, **arrays)
+        return TouchCandidates(parts[0].placement_names, **arrays)
 
     def as_measurements(self) -> Measurements:
         """Return the measurements that the nominal robot would yield at the nominal placements, for planning."""
@@ -143,12 +143,12 @@ class TouchCandidates:
             q=self.q,
             frame=self.frame,
             touch_axis=self.touch_axis,
-            touch=self.coordinate,
+            touch=self.face_coordinate,
             source="planned touches",
         )
 
 
-_ARRAYS = ("placement", "face", "axis", "sign", "coordinate", "T_jig_tool", "q")
+_ARRAYS = ("placement", "face", "axis", "outward_sign", "face_coordinate", "T_jig_tool", "q")
 
 
 class TouchCandidatesSection(Section):
@@ -198,7 +198,7 @@ class TouchCandidatesSection(Section):
         parts = [self._of_placement(robot, placement, generator) for placement in placements]
         numbers = torch.arange(len(parts)).repeat_interleave(self.count)
         names = tuple(placement.name for placement in placements)
-        return replace(TouchCandidates.concatenate(parts), placements=names, placement=numbers)
+        return replace(TouchCandidates.concatenate(parts), placement_names=names, placement=numbers)
 
     def _of_placement(
         self, robot: Robot, placement: JigPlacement, generator: torch.Generator
@@ -239,12 +239,12 @@ class TouchCandidatesSection(Section):
         R = rotation_from_zyx(torch.stack([azimuth, tilt, zero], -1))
         R = R @ rotation_from_zyx(torch.stack([about_wire, zero, zero + torch.pi], -1))
         sampled = TouchCandidates(
-            placements=(name,),
+            placement_names=(name,),
             placement=torch.zeros_like(face),
             face=face,
             axis=jig.axis[face],
-            sign=jig.sign[face],
-            coordinate=jig.coordinate[face],
+            outward_sign=jig.sign[face],
+            face_coordinate=jig.coordinate[face],
             T_jig_tool=transform(R, point),
             q=torch.zeros(_CANDIDATES_PER_DRAW, dof, dtype=torch.float64),
         )
@@ -268,7 +268,7 @@ class TouchCandidatesSection(Section):
         """Return the candidates that the nominal robot can reach, with their joint values."""
         T_base_jig = invert(placement.T_jig_base)
         T = T_base_jig @ sampled.T_jig_tool
-        q, reached = self.branch.find(robot, T)
+        q, reached = self.branch.solve_nominal(robot, T)
         reached = reached & (singularity_measure(robot, q) >= self.least_singular_value)
         sampled = replace(sampled, q=q).select(reached)
         T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[sampled.face].mT).mT

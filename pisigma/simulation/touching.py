@@ -139,8 +139,8 @@ def _approach(
     true_Ts_jig_base = torch.stack([p.true_T_jig_base for p in placements])[candidates.placement]
     T = invert(Ts_jig_base) @ candidates.T_jig_tool
     along = torch.nn.functional.one_hot(candidates.axis, 3).to(T)
-    inward = -(Ts_jig_base[:, :3, :3].mT @ (along * candidates.sign[:, None])[..., None])[..., 0]
-    coordinate = candidates.coordinate + draws.sensor[:, 0]
+    inward = -(Ts_jig_base[:, :3, :3].mT @ (along * candidates.outward_sign[:, None])[..., None])[..., 0]
+    coordinate = candidates.face_coordinate + draws.sensor[:, 0]
     moved, q = torch.zeros_like(coordinate), candidates.q
     for _ in range(MAX_ITERATIONS):
         here = transform(T[:, :3, :3], T[:, :3, 3] + moved[:, None] * inward)
@@ -148,7 +148,7 @@ def _approach(
         q = solution.q
         position = robot.forward(q)[:, :3, 3] + draws.robot
         tip = (true_Ts_jig_base[:, :3, :3] @ position[..., None])[..., 0] + true_Ts_jig_base[:, :3, 3]
-        gap = candidates.sign * ((tip * along).sum(-1) - coordinate)
+        gap = candidates.outward_sign * ((tip * along).sum(-1) - coordinate)
         open_ = (
             (gap.abs() > _CONTACT_TOLERANCE)
             & (moved.abs() <= travel)

@@ -117,13 +117,13 @@ class TrueRobot:
     Attributes:
         nominal: the nominal robot.
         errors: the error sources.
-        geometry: the robot with the true geometric parameters, for actual joint values.
+        true_geometry: the robot with the true geometric parameters, for actual joint values.
         half_play: `(dof,)`, distance by which every joint stops short of the commanded value [rad or m].
     """
 
     nominal: Robot
     errors: Sequence[AbstractErrorSource] = ()
-    geometry: Robot = field(init=False)
+    true_geometry: Robot = field(init=False)
     half_play: Float64[Tensor, " dof"] = field(init=False, repr=False)
     _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
 
@@ -153,7 +153,7 @@ class TrueRobot:
                 )
             stepped |= source.stepped_joints
         object.__setattr__(self, "errors", tuple(self.errors))
-        object.__setattr__(self, "geometry", self.nominal.with_geometry(dh, base, tool))
+        object.__setattr__(self, "true_geometry", self.nominal.with_geometry(dh, base, tool))
         object.__setattr__(self, "half_play", half_play)
         object.__setattr__(self, "_joint_errors", tuple(joint_errors))
 
@@ -212,7 +212,7 @@ class TrueRobot:
             q: commanded joint values [rad or m].
             approach: direction of approach of every joint; None for the middle of all play.
         """
-        return forward_kinematics(self.geometry, self.actual_joints(q, approach))
+        return forward_kinematics(self.true_geometry, self.actual_joints(q, approach))
 
     def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """Return the joint values to command [rad or m] so that the actual joint values are `actual`.
@@ -265,7 +265,7 @@ class TrueRobot:
                 joints.
             UnreachablePoseError: the true robot cannot reach a pose on this branch, or it has encoder steps.
         """
-        solution = solve_numeric(self.geometry, T, start)
+        solution = solve_numeric(self.true_geometry, T, start)
         missed = solution.status == Status.NOT_CONVERGED
         if missed.any():
             index = tuple(missed.nonzero()[0].tolist())

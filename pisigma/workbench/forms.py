@@ -76,9 +76,7 @@ def form_of(step: str, file: CellFile) -> list[Field]:
     stated, fields = file.stated_values(step), []
     for one in _settings(step):
         key, option = one.key, one.name
-        if (
-            one.option.is_key_only or one.default is False
-        ):  # there is no option that switches these settings off
+        if one.option.is_key_only or one.default is False:  # no option switches these settings off
             option = f"--set {key}="
         default = _text(stated.get(key, one.default))
         fields.append(

@@ -79,28 +79,28 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     )
 
 
-def write_cell(folder: Path, form: Form, earlier_texts: dict[str, str]) -> None:
+def write_cell(folder: Path, form: Form, undo_texts_by_digest: dict[str, str]) -> None:
     """Write `cell.yaml` if the new text is valid and the file has not changed since the person saw it.
 
     Args:
         folder: folder of the cell, whose file need not be valid.
         form: "seen", the digest of the file that the person saw, with its new "text" or the values of its form; or
             "undo", the digest of the file whose last change is undone.
-        earlier_texts: the text before every change, by the digest of the text after it.
+        undo_texts_by_digest: the text before every change, by the digest of the text after it.
 
     Raises:
         PlanningError: the file has been changed in the meantime, or the new text is not valid.
     """
     before = cell_file_text(folder)
     digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
-    if digest not in (form.get("seen"), undo) or (undo and undo not in earlier_texts):
+    if digest not in (form.get("seen"), undo) or (undo and undo not in undo_texts_by_digest):
         raise PlanningError(
             "the file has been changed since it was shown here",
             at=Place(folder / CELL_FILE),
             remedy="copy what you entered, discard your changes, and repeat them",
         )
     text = (
-        earlier_texts[undo]
+        undo_texts_by_digest[undo]
         if undo
         else changed_cell_text(CellFile.read(folder), form)
         if entered is None
@@ -108,9 +108,9 @@ def write_cell(folder: Path, form: Form, earlier_texts: dict[str, str]) -> None:
     )
     CellFile.write(folder, text)
     if undo:
-        del earlier_texts[undo]
+        del undo_texts_by_digest[undo]
     elif text != before:
-        earlier_texts[digest_of(text)] = before
+        undo_texts_by_digest[digest_of(text)] = before
 
 
 def plan(cell: Cell, form: Form, progress: Progress) -> Outcome:

@@ -96,9 +96,6 @@ class UploadedRowsHandler:
     def _incoming(self, cell: Cell, form: Mapping[str, str]) -> IncomingRows:
         """Return the uploaded files of a form, or the growing file."""
         numbers = form.get("files", "").split(",")
-        files = (
-            [self.growing_file]
-            if numbers == [_GROWING] and self.growing_file
-            else self._uploads.paths(numbers)
-        )
+        one = self.growing_file
+        files = [one] if numbers == [_GROWING] and one else self._uploads.paths(numbers)
         return steps.incoming_rows(files, cell, form)

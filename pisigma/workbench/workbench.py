@@ -67,7 +67,7 @@ class Workbench(UploadedRowsHandler):
         folder: folder of the cell.
         jobs: the running step, and the last outcomes.
         url: link to the page, with its token.
-        growing: file to which an instrument writes rows; None for none.
+        growing_file: file to which an instrument writes rows; None for none.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Workbench(UploadedRowsHandler):
             OutputError: the host is not an address of this machine.
             PlanningError: the folder is not a cell, and not empty.
         """
-        self.folder, self._has_cell, self.growing = folder, False, growing
+        self.folder, self._has_cell, self.growing_file = folder, False, growing
         cell = self._cell() if self._fault() is None else None
         self._status: tuple[CellStatus | None, float] = None, -math.inf
         if cell is not None:
@@ -323,10 +323,10 @@ class Workbench(UploadedRowsHandler):
             self._tabs.live = {**state.to_json(), "unchecked": 0}
             self.jobs.version += 1
 
-        if self.growing is None:
+        if self.growing_file is None:
             raise PlanningError("no file is followed", remedy="open the page with --rows FILE")
         try:
-            return steps.follow_file(cell, self.growing, arrived, show, progress)
+            return steps.follow_file(cell, self.growing_file, arrived, show, progress)
         finally:
             self._tabs.live = None
 

@@ -36,7 +36,7 @@ def test_the_product_does_not_train_it(repository):
 
 
 def test_the_true_robot_has_the_papers_values(recipe):
-    published, robot = recipe.paper["parameters"]["both"], recipe.true_robot().geometry
+    published, robot = recipe.paper["parameters"]["both"], recipe.true_robot().true_geometry
     columns = {"theta": 0, "d": 1, "a": 2}
     for name in recipe.paper_parameters:
         column, row = name.split("_")
@@ -61,7 +61,7 @@ def test_without_noise_the_papers_parameters_come_back(recipe):
         found = calibrate_on(stated, measurements, frames)
         assert len(found.result.free_parameters) == count
         assert list(found.bases) == list(frames)
-        true = stated.true_robot().geometry
+        true = stated.true_robot().true_geometry
         assert_close(found.arm.dh, true.dh, atol=1e-9)
         assert_close(found.arm.tool, true.tool, atol=1e-9)
         for placement in stated.placements:
@@ -78,7 +78,7 @@ def test_a_third_jig_adds_six_unknowns(recipe):
     stated = small(recipe, noise=exact, placements=(*recipe.placements, third))
     found = calibrate_on(stated, stated.measure(stated.draw_touches(0), 0), stated.frames)
     assert len(found.result.free_parameters) == 29
-    assert_close(found.arm.dh, stated.true_robot().geometry.dh, atol=1e-9)
+    assert_close(found.arm.dh, stated.true_robot().true_geometry.dh, atol=1e-9)
     difference = torch.from_numpy(found.bases["jig_3"] - third.true_base.to_si())
     difference[3:] = wrap_to_pi(difference[3:])
     assert_close(difference, torch.zeros(6), atol=1e-9)

@@ -62,7 +62,7 @@ def test_rms_and_deviation_are_those_of_the_papers_tables(recipe):
 def test_the_true_parameters_have_no_error(recipe):
     bench = Bench.from_recipe(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
-    accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.geometry, bases))
+    accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.true_geometry, bases))
     assert_close(accuracy.points, torch.zeros(4, 3), atol=1e-12)
     assert_close(accuracy.workspace, torch.zeros(len(bench.workspace)), atol=1e-12)
     for errors in accuracy.seen_from.values():
@@ -73,7 +73,7 @@ def test_an_error_of_a_jigs_base_is_seen_from_that_jig_only(recipe):
     bench = Bench.from_recipe(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
     bases["jig_2"] = bases["jig_2"] + np.array([1e-3, 0, -2e-3, 0, 0, 0])
-    accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.geometry, bases))
+    accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.true_geometry, bases))
     assert_close(accuracy.points, torch.zeros(4, 3), atol=1e-12)
     assert_close(accuracy.seen_from["jig_1"], torch.zeros(4, 3), atol=1e-12)
     assert_close(accuracy.seen_from["jig_2"], torch.tensor([[-1e-3, 0, 2e-3]] * 4), atol=1e-9)

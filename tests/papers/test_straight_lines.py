@@ -37,7 +37,7 @@ SHIFT = torch.tensor([0, 0.8, 0], dtype=torch.float64)
 @pytest.mark.parametrize("rows", [ERRORS, ERRORS | {"theta_2": {"beta_deg": 0.3}}])
 def test_with_the_true_parameters_lines_are_straight(rows: dict):
     true = true_robot(rows)
-    controller = Controller(NOMINAL, true.geometry, BRANCH)
+    controller = Controller(NOMINAL, true.true_geometry, BRANCH)
     assert controller.is_closed_form == ("theta_2" not in rows)
     for line in (move_l(true, controller, LINE), i_move(true, controller, LINE[0], SHIFT)):
         assert line.wanted.shape == (101, 3)
@@ -83,7 +83,7 @@ def test_a_wrong_zero_of_the_first_joint_rotates_an_i_move():
 
 
 def test_a_controller_without_a_closed_form_reaches_its_poses():
-    robot = true_robot(ERRORS | {"theta_2": {"alpha_deg": 0.2}}).geometry
+    robot = true_robot(ERRORS | {"theta_2": {"alpha_deg": 0.2}}).true_geometry
     controller = Controller(NOMINAL, robot, BRANCH)
     assert not controller.is_closed_form
     assert_close(forward_kinematics(robot, controller.joints(LINE)), LINE, atol=1e-9)

@@ -12,7 +12,7 @@ from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.se3 import pose_error
-from pisigma.simulation.measure import SimulatedMeasurements, simulate
+from pisigma.simulation.measure import SimulatedTracker, simulate
 from pisigma.simulation.noise import MeasurementNoise
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 
@@ -45,7 +45,7 @@ def true_robot(name: str, *errors: dict) -> TrueRobot:
 @pytest.mark.parametrize("branch", ["elbow_positive", "elbow_negative"])
 def test_desired_poses_are_reached_by_the_true_robot_on_the_named_branch(branch):
     robot = true_robot("kiro3", GEOMETRIC, OFFSET)
-    section = SimulatedMeasurements(poses=GRID, branch={"name": branch})
+    section = SimulatedTracker(poses=GRID, branch={"name": branch})
     data = section.measure(robot)
     assert data.kinds == {"pose"}
     assert_close(data.T, section.poses.transforms(), atol=1e-12)
@@ -58,13 +58,11 @@ def test_the_nearest_branch_contains_the_given_joint_values():
     robot = true_robot("kiro4", OFFSET)
     solver = closed_form_solver(robot.nominal)
     for index, name in enumerate(solver.branches[:4]):
-        named = SimulatedMeasurements(poses=CUBE | {"count": 1}, branch={"name": name}).measure(robot)
+        named = SimulatedTracker(poses=CUBE | {"count": 1}, branch={"name": name}).measure(robot)
         T = named.T
         near = torch.rad2deg(solver.solve(T).q[0, index]).tolist()
         near_deg = {joint.name: value + 360 for joint, value in zip(robot.nominal.joints, near, strict=True)}
-        nearest = SimulatedMeasurements(poses=CUBE | {"count": 1}, branch={"near_deg": near_deg}).measure(
-            robot
-        )
+        nearest = SimulatedTracker(poses=CUBE | {"count": 1}, branch={"near_deg": near_deg}).measure(robot)
         assert_close(nearest.q, named.q, atol=1e-11)
 
 
@@ -80,16 +78,14 @@ def test_a_robot_without_a_closed_form_starts_from_the_given_joint_values():
         "orientation": {"home_rotation": centre[:3, :3].tolist()},
     }
     cube |= {"x_mm": (x - 50, x + 50), "y_mm": (y - 50, y + 50), "z_mm": (z - 50, z + 50)}
-    data = SimulatedMeasurements(poses=cube, branch={"near_deg": near}).measure(robot)
+    data = SimulatedTracker(poses=cube, branch={"near_deg": near}).measure(robot)
     assert_close(data.position[[0, 7]] - centre[:3, 3], [[-0.05] * 3, [0.05] * 3], atol=1e-12)
     assert float((data.q - home).abs().max()) < 0.3
 
 
 def test_joint_values_are_commanded_as_drawn():
     robot = true_robot("ur10", OFFSET)
-    section = SimulatedMeasurements(
-        poses={"kind": "joints_random", "count": 20, "seed": 3}, sensor="position"
-    )
+    section = SimulatedTracker(poses={"kind": "joints_random", "count": 20, "seed": 3}, sensor="position")
     data = section.measure(robot)
     assert_close(data.q, section.poses.joints(robot.nominal))
     assert_close(data.position, robot.forward(data.q)[:, :3, 3])
@@ -100,7 +96,7 @@ def test_joint_values_are_commanded_as_drawn():
 
 def test_with_an_encoder_the_robot_stops_near_the_desired_pose():
     robot = true_robot("kiro3", OFFSET, ENCODER)
-    section = SimulatedMeasurements(poses=GRID, branch={"name": "elbow_positive"})
+    section = SimulatedTracker(poses=GRID, branch={"name": "elbow_positive"})
     data = section.measure(robot)
     away = pose_error(data.T, section.poses.transforms())[:, :3].norm(dim=-1)
     half_a_pulse = math.pi / 2048
@@ -134,8 +130,8 @@ noise: {position_mm: 0.05, seed: 1}
 """
 
 
-def read(text: str) -> SimulatedMeasurements:
-    return parse_yaml(text, SimulatedMeasurements, RecipeError, "recipe.yaml")
+def read(text: str) -> SimulatedTracker:
+    return parse_yaml(text, SimulatedTracker, RecipeError, "recipe.yaml")
 
 
 def test_recipe_is_read():
@@ -174,27 +170,27 @@ def test_joint_values_have_no_branch():
 )
 def test_branches_that_do_not_exist_are_refused(robot, branch, value, name):
     with refused(RecipeError, option="branch", value=value) as caught:
-        SimulatedMeasurements(poses=GRID, branch=branch).measure(true_robot(robot))
+        SimulatedTracker(poses=GRID, branch=branch).measure(true_robot(robot))
     assert name in caught.value.remedy
 
 
 @pytest.mark.parametrize("branch", [{"name": "elbow_positive"}, {"near_deg": {}}])
 def test_poses_out_of_reach_are_refused(branch):
-    section = SimulatedMeasurements(poses=GRID | {"r_mm": (500, 700)}, branch=branch)
+    section = SimulatedTracker(poses=GRID | {"r_mm": (500, 700)}, branch=branch)
     with refused(UnreachablePoseError, option="poses", value=8) as caught:
         section.measure(true_robot("kiro3"))
     assert "4 of 12" in str(caught.value)
 
 
 def test_poses_outside_the_joint_limits_are_refused():
-    section = SimulatedMeasurements(poses=GRID | {"z_mm": 500}, branch={"name": "elbow_positive"})
+    section = SimulatedTracker(poses=GRID | {"z_mm": 500}, branch={"name": "elbow_positive"})
     with refused(RecipeError, option="poses", value=0) as caught:
         section.measure(true_robot("kiro3"))
     assert "12 of 12" in str(caught.value)
 
 
 def test_every_row_of_the_paper_cube_is_reached():
-    data = SimulatedMeasurements(poses=CUBE, branch={"name": "front/elbow_up/no_flip"}).measure(
+    data = SimulatedTracker(poses=CUBE, branch={"name": "front/elbow_up/no_flip"}).measure(
         TrueRobot(Robot.load("kiro4"))
     )
     assert data.rows == 50

@@ -6,7 +6,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.simulation.measure import SimulatedMeasurements
+from pisigma.simulation.measure import SimulatedTracker
 from pisigma.simulation.true_robot import TrueRobotSection
 
 # Jeong, Kim and Kwak 1998, Table 1, "before calibration" [deg]: average, deviation, maximum of |error|.
@@ -55,7 +55,7 @@ def joint_errors() -> tuple[torch.Tensor, torch.Tensor]:
         "phi_steps": 10,
         "z_mm": 300,
     }
-    data = SimulatedMeasurements(poses=grid, branch={"name": "elbow_positive"}).measure(true_robot)
+    data = SimulatedTracker(poses=grid, branch={"name": "elbow_positive"}).measure(true_robot)
     x, y, _ = data.position.unbind(-1)
     return data.q[:, :2] - nominal_inverse(x, y, 0.32, 0.32), data.position
 

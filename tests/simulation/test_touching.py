@@ -118,7 +118,7 @@ def test_candidates_can_be_touched():
     found = stated.find(robot, PLACEMENTS)
     assert found.count == 240
     tip, shaft = found.T_jig_tool[:, :3, 3], -found.T_jig_tool[:, :3, 2]
-    assert_close(tip[torch.arange(240), found.axis], found.coordinate, atol=1e-15)
+    assert_close(tip[torch.arange(240), found.axis], found.face_coordinate, atol=1e-15)
     assert bool(jig.is_on_face(found.face, tip, 0.0199).all())
     assert bool((shaft[:, 2] >= math.cos(math.radians(30)) - 1e-12).all())
     lean = (shaft * jig.outward[found.face]).sum(-1)
@@ -154,7 +154,7 @@ def test_noise_has_its_standard_deviation():
     error = true_coordinates(robot, data) - data.touch
     assert_close(error.std(), 0.25e-3, rtol=0.12)
     assert abs(float(error.mean())) < 3 * 0.25e-3 / math.sqrt(200)
-    assert_close(data.touch, candidates.coordinate)
+    assert_close(data.touch, candidates.face_coordinate)
 
 
 def test_candidates_are_selected_by_index_or_mask():

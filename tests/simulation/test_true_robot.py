@@ -78,12 +78,12 @@ def test_errors_are_added_in_any_order(generator):
     alone = [true_robot(source) for source in sources]
     assert_close(together.joint_error(q), sum(robot.joint_error(q) for robot in alone), atol=1e-16)
     assert_close(
-        together.geometry.dh - together.nominal.dh,
-        sum(r.geometry.dh - r.nominal.dh for r in alone),
+        together.true_geometry.dh - together.nominal.dh,
+        sum(r.true_geometry.dh - r.nominal.dh for r in alone),
         atol=1e-15,
     )
-    assert_close(together.geometry.base, sum(robot.geometry.base for robot in alone), atol=1e-16)
-    assert_close(together.geometry.tool, sum(robot.geometry.tool for robot in alone), atol=1e-16)
+    assert_close(together.true_geometry.base, sum(robot.true_geometry.base for robot in alone), atol=1e-16)
+    assert_close(together.true_geometry.tool, sum(robot.true_geometry.tool for robot in alone), atol=1e-16)
     assert_close(together.forward(q), reversed_order.forward(q), atol=1e-14)
     for robot in alone:  # none of them does nothing
         assert float((robot.forward(q) - forward_kinematics(robot.nominal, q)).abs().max()) > 1e-5
@@ -93,7 +93,7 @@ def test_forward_is_kinematics_of_the_true_geometry_at_the_actual_joints(generat
     q = joints(generator, 20)
     robot = true_robot(*SMOOTH)
     assert_close(robot.actual_joints(q) - q, robot.joint_error(q), atol=1e-15)
-    assert_close(robot.forward(q), forward_kinematics(robot.geometry, robot.actual_joints(q)))
+    assert_close(robot.forward(q), forward_kinematics(robot.true_geometry, robot.actual_joints(q)))
     assert robot.nominal.dh.tolist() == Robot.load("ur10").dh.tolist()
 
 
@@ -165,7 +165,7 @@ errors:
 
 def test_recipe_is_read_and_misspelt_keys_are_refused():
     robot = parse_yaml(RECIPE, TrueRobotSection, RecipeError, "recipe.yaml").true_robot()
-    assert_close(robot.geometry.dh[0, 2], 0.3147, atol=1e-16)
+    assert_close(robot.true_geometry.dh[0, 2], 0.3147, atol=1e-16)
     assert_close(
         robot.joint_error(torch.zeros(4, dtype=torch.float64)), [0, math.radians(3.7), 0, 0], atol=1e-17
     )

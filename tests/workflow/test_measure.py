@@ -47,11 +47,11 @@ def test_before_anything_is_measured():
 def test_the_state_tells_used_rows_and_alarms(session):
     state = session.state
     assert len(state.rows.line) == 18
-    assert state.rows.alarmed.tolist() == [row == 14 for row in range(18)]
+    assert state.rows.is_unused.tolist() == [row == 14 for row in range(18)]
     assert [alarm.line for alarm in state.alarms] == [16, 20]
-    assert int(state.rows.check.sum()) == CHECKS - 1
+    assert int(state.rows.is_test_row.sum()) == CHECKS - 1
     assert state.base.shape == (4, 4)
-    assert abs(state.rows.error[~state.rows.alarmed]).max() < 3e-3
+    assert abs(state.rows.error[~state.rows.is_unused]).max() < 3e-3
     assert state.rows.error[14].tolist() != [0, 0, 0]
     for span in state.coverage:
         assert span.lower < span.upper

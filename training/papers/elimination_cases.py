@@ -60,7 +60,7 @@ def report_eliminations(
                 "values": _values(found.robot, names, space),
             }
         )
-    truth = TrueRobot(Robot.load(recipe.robot), recipe.errors).geometry
+    truth = TrueRobot(Robot.load(recipe.robot), recipe.errors).true_geometry
     return {"elimination_cases": compared, "true_values": _values(truth, names, space)}
 
 

@@ -189,7 +189,7 @@ class JigRecipe(Section):
     def workspace_joints(self) -> Float64[Tensor, "poses dof"]:
         """Return joint values [rad or m] of the nominal robot at the reachable poses of the workspace."""
         robot = Robot.load(self.robot)
-        q, reached = BranchSection(near_deg={}).find(robot, self.workspace.transforms())
+        q, reached = BranchSection(near_deg={}).solve_nominal(robot, self.workspace.transforms())
         return q[reached & (singularity_measure(robot, q) >= CLEAR_OF_SINGULARITIES)]
 
     def planning_problem(self, candidates: TouchCandidates, prior: Prior | None = None) -> PlanningProblem:

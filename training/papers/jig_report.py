@@ -148,7 +148,7 @@ def parameter_table(run: JigRun) -> list[dict[str, Any]]:
     published = recipe.paper.get("parameters", {})
     truth = {p.name: (p.true_base or p.base).to_si() for p in recipe.placements}
     values = {name: _values(c.arm, c.bases) for name, c in run.calibrations.items()}
-    values["true"] = _values(run.bench.true_robot.geometry, truth)
+    values["true"] = _values(run.bench.true_robot.true_geometry, truth)
     tool = tuple(f"tool_{column}" for column in ("x", "y", "z"))
     names = [*recipe.paper_parameters, *tool]
     names += [f"base_{frame}_{column}" for frame in recipe.frames for column in FRAME_COLUMNS]

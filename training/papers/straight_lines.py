@@ -46,7 +46,7 @@ class Controller:
             UnreachablePoseError: A pose cannot be reached on this branch.
         """
         arm = self.robot if self.is_closed_form else self.nominal
-        q, reached = self.branch.find(arm, T)
+        q, reached = self.branch.solve_nominal(arm, T)
         if reached.all() and not self.is_closed_form:
             solution = solve_numeric(self.robot, T, q)
             q, reached = solution.q, solution.status != Status.NOT_CONVERGED

@@ -220,12 +220,14 @@ class SimulatedImages(Section):
         q, is_fixed = self._joints(robot), self.camera.is_fixed
         noise = ImageNoise(self.noise.corner_px, self.noise.repeatability)
         actual = robot.actual_joints(q)
-        images = simulate_images(robot.geometry, actual, *self._true(), noise, self._generator(), is_fixed)
+        images = simulate_images(
+            robot.true_geometry, actual, *self._true(), noise, self._generator(), is_fixed
+        )
         stated = self.camera.camera(), self.board.board()
         images = replace(images, q=self._read(q), source=f"simulation of {robot.nominal.name}")
         return image_measurements(images, *stated, is_fixed, self.noise.repeatability)
 
-    def joints_read(self, robot: TrueRobot) -> Float64[Tensor, "images dof"]:
+    def joint_readings(self, robot: TrueRobot) -> Float64[Tensor, "images dof"]:
         """Return the joint values that are read for the images [rad or m]."""
         return self._read(self._joints(robot))
 
@@ -234,7 +236,7 @@ class SimulatedImages(Section):
         camera, board = self._true()
         q, rng = robot.actual_joints(self._joints(robot)), np.random.default_rng(self.noise.seed)
         poses = noisy_board_poses(
-            robot.geometry, q, self.noise.repeatability, self._generator(), self.camera.is_fixed
+            robot.true_geometry, q, self.noise.repeatability, self._generator(), self.camera.is_fixed
         )
         for pose in poses.numpy():
             yield render_image(camera, board, pose, Exposure(), rng)
@@ -243,7 +245,7 @@ class SimulatedImages(Section):
         return torch.Generator().manual_seed(self.noise.seed)
 
     def _joints(self, robot: TrueRobot) -> Float64[Tensor, "images dof"]:
-        nominal, true = robot.nominal, robot.geometry
+        nominal, true = robot.nominal, robot.true_geometry
         aimed = nominal.with_geometry(nominal.dh, true.base, true.tool)
         return self.poses.joints(aimed, self.camera.camera(), self.board.board(), self.camera.is_fixed)
 
@@ -375,7 +377,7 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
     lines = [",".join(("image", *names))]
     files = [f"{number:04d}.png" for number in range(images.poses.count)]
     with staged_folder(folder, names=(*files, *_GIVEN_FILES)) as scratch:
-        q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
+        q = robot.nominal.to_controller(images.joint_readings(robot)).numpy()
         for file, joints, image in zip(files, q, images.render(robot), strict=True):
             Image.fromarray(image).save(scratch / file)
             shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))

@@ -33,7 +33,7 @@ def with_error_answers(function: Callable[[Any, web.Request], Awaitable[web.Stre
             return web.json_response({"error": self._uploads.without_folder(fault), "field": ""}, status=422)
         except BusyError:
             job = self.jobs.running
-            who = "somebody" if job is None else f"{job.person}: {job.step}"
+            who = "somebody" if job is None else f"{job.started_by}: {job.step}"
             return web.json_response(
                 {"error": f"another step is running ({who}); wait until it ends."}, status=409
             )

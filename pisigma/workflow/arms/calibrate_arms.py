@@ -303,12 +303,12 @@ class ArmsDocument(Section):
     calibrate: dict[str, Any] | None = None
 
 
-def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, ...]:
+def arms_of_cell(folder: str | os.PathLike[str], **overrides: Any) -> tuple[Arm, ...]:
     """Read the arms of a cell.
 
     Args:
         folder: folder of the cell.
-        **changed: settings of the calibration that override the file, by its keys.
+        **overrides: settings of the calibration that override the file, by its keys.
 
     Raises:
         PlanningError: `cell.yaml` is not valid, or a file is outside the cell.
@@ -327,7 +327,7 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
             for those in (arm.sessions, arm.touches)
         )
         robot = Robot.load(file.robot, arm.base, arm.tip)
-        settings = file.settings_of_step("calibrate", **changed)
+        settings = file.settings_of_step("calibrate", **overrides)
         arms.append(Arm(name, robot, rows, settings, touches or None))
     return tuple(arms)
 
@@ -336,7 +336,7 @@ def calibrate_arms_of_cell(
     folder: str | os.PathLike[str],
     progress: Progress = lambda what: None,
     accept_implausible: bool = False,
-    **changed: Any,
+    **overrides: Any,
 ) -> tuple[ArmsCalibration, Path | None]:
     """Calibrate the arms of a cell, and write `models/DAY/ARM` for each and `models/DAY/frames.yaml`.
 
@@ -344,7 +344,7 @@ def calibrate_arms_of_cell(
         folder: folder of the cell.
         progress: called with the current step.
         accept_implausible: whether to also store a result that must not be trusted.
-        **changed: settings that override the file, by its keys.
+        **overrides: settings that override the file, by its keys.
 
     Returns:
         The calibration, and the folder with the models, which is None if the result must not be trusted and was not
@@ -353,7 +353,7 @@ def calibrate_arms_of_cell(
     Raises:
         PisigmaError: see `arms_of_cell` and `calibrate_arms`.
     """
-    found = calibrate_arms(arms_of_cell(folder, **changed), progress)
+    found = calibrate_arms(arms_of_cell(folder, **overrides), progress)
     if not (found.trusted or accept_implausible):
         return found, None
     save = partial(found.save, accept_implausible=accept_implausible)

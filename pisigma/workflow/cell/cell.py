@@ -137,7 +137,7 @@ class Cell:
         return self.folder / MODELS / name
 
     def plan(
-        self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
+        self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **overrides: Any
     ) -> tuple[Plan, Path]:
         """Plan the poses to measure; every plan of a cell has different poses.
 
@@ -146,13 +146,13 @@ class Cell:
         Args:
             progress: called with the name of each step.
             programs: files of robot programs that are also written.
-            **changed: options of `pisigma plan` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma plan` that override `cell.yaml`, by its keys.
 
         Returns:
             The plan, and its CSV file in `plans/`.
         """
         facts = self.status().facts
-        entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
+        entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **overrides)
         subject = self.model_folder(entry.name) if entry is not None and entry.has_posterior else self.robot
         planned = plan(subject, settings, self.file.document.surroundings, progress)
         with self.history.database.transaction():  # reserved, so that no other process chooses the same name
@@ -179,7 +179,7 @@ class Cell:
         progress: Progress = lambda what: None,
         accept_implausible: bool = False,
         prior: Path | None = None,
-        **changed: Any,
+        **overrides: Any,
     ) -> tuple[Calibration | Recalibration, ModelEntry | None]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
@@ -191,7 +191,7 @@ class Cell:
             progress: called with the name of each step.
             accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
             prior: model folder of `pisigma fleet prior` to start from; None for none.
-            **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
             The calibration and the entry of its model; the entry is None if an untrusted model was not stored.
@@ -201,7 +201,7 @@ class Cell:
         """
         sessions, started, events = self.sessions.valid_sessions(), now(), self.history.events()
         warnings, stated = self.controller_warnings("calibrate", None), self._settings_sha256
-        settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
+        settings: CalibrationSettings = self.file.settings_of_step("calibrate", **overrides)
         result = calibrate_rows(
             self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
         )
@@ -223,14 +223,14 @@ class Cell:
         return result, entry
 
     def verify(
-        self, session: str | None = None, model: str | None = None, **changed: Any
+        self, session: str | None = None, model: str | None = None, **overrides: Any
     ) -> tuple[Verification, ModelEntry]:
         """Verify a model with a session to which it was not fitted; put it into use if it passes and is newer.
 
         Args:
             session: name of the session; None for the newest session to which the model was not fitted.
             model: name of the model; None for the model in use or, if there is none, the newest.
-            **changed: options of `pisigma verify` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma verify` that override `cell.yaml`, by its keys.
 
         Returns:
             The verification and the entry of the model.
@@ -240,7 +240,7 @@ class Cell:
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         entry, chosen, seen = self._new_rows("verify", model, session)
-        settings = seen.settings_to_fit(self.file.settings_of_step("verify", **changed))
+        settings = seen.settings_to_fit(self.file.settings_of_step("verify", **overrides))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         errors, moved = found.comparison.models[-1].position.statistics, found.verdict == "moved"
         found_by = ("verify", entry.name, chosen.name, found.verdict, found.sentence)
@@ -250,12 +250,12 @@ class Cell:
             self.history.add(InUse(entry.name, now(), f"verified with session '{chosen.name}'"))
         return found, entry
 
-    def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> MonitoringResult:
+    def monitor(self, progress: Progress = lambda what: None, **overrides: Any) -> MonitoringResult:
         """Compare every session newer than the model in use with this model, to detect moved parts.
 
         Args:
             progress: called with the name of each step.
-            **changed: options of `pisigma monitor` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma monitor` that override `cell.yaml`, by its keys.
 
         Returns:
             The result for the newest session; the history contains a check for every session.
@@ -271,7 +271,7 @@ class Cell:
             seen = self.sessions.rows_with_model_names(entry, self.sessions.rows_of_file(one), one.day)
             moved = {"moved": ",".join(seen.changed_frames)} if seen.changed_frames else {}
             settings = replace(
-                self.file.settings_of_step("monitor", **(moved | changed)), cameras=None, dates=(one.day,)
+                self.file.settings_of_step("monitor", **(moved | overrides)), cameras=None, dates=(one.day,)
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
@@ -280,18 +280,18 @@ class Cell:
         assert found is not None  # there is a session
         return replace(found, warnings=(*warnings, *found.warnings))
 
-    def evaluate(self, **changed: Any) -> Evaluation:
+    def evaluate(self, **overrides: Any) -> Evaluation:
         """Compare the model in use with the nominal robot on the newest session to which it was not fitted.
 
         Args:
-            **changed: options of `pisigma evaluate` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma evaluate` that override `cell.yaml`, by its keys.
 
         Raises:
             ModelError: there is no model.
             MeasurementError: there is no session to which the model was not fitted.
         """
         entry, _, seen = self._new_rows("evaluate", None, None)
-        settings = seen.settings_to_fit(self.file.settings_of_step("evaluate", **changed))
+        settings = seen.settings_to_fit(self.file.settings_of_step("evaluate", **overrides))
         return evaluate(self.model_folder(entry.name), seen.rows, settings)
 
     def recalibrate(
@@ -299,7 +299,7 @@ class Cell:
         session: str | None = None,
         progress: Progress = lambda what: None,
         accept_implausible: bool = False,
-        **changed: Any,
+        **overrides: Any,
     ) -> tuple[Recalibration, ModelEntry | None]:
         """Recalibrate the model in use with the newest session; put the result into use if it can be trusted.
 
@@ -309,7 +309,7 @@ class Cell:
             session: name of the session; None for the newest session to which the model was not fitted.
             progress: called with the name of each step.
             accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
-            **changed: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
+            **overrides: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
 
         Returns:
             The recalibration and the entry of its model; the entry is None if an untrusted model was not stored.
@@ -320,7 +320,7 @@ class Cell:
         """
         started = now()
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
-        settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
+        settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **overrides))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
         found = (*self.controller_warnings("recalibrate", parent), *self.file.measured_joints_warnings())
         result = with_warnings(result, found)

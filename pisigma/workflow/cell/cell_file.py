@@ -221,37 +221,37 @@ class CellFile:
             shared["sensor"] = sensor
         return {key: value for key, value in shared.items() if key in known} | section
 
-    def settings_of_step(self, step: str, **changed: Any) -> Any:
+    def settings_of_step(self, step: str, **overrides: Any) -> Any:
         """Return the settings of a step.
 
         Args:
             step: a key of `STEPS`.
-            **changed: values that override the file, by its keys; their paths may be outside the cell.
+            **overrides: values that override the file, by its keys; their paths may be outside the cell.
 
         Raises:
             PisigmaError: a setting is not valid; the message names file, line and key.
         """
         return settings_from(
             STEPS[step],
-            self.stated_values(step) | changed,
+            self.stated_values(step) | overrides,
             self._place(step),
             self.path.parent,
-            frozenset(changed),
+            frozenset(overrides),
         )
 
     def measured_joints_warnings(self) -> tuple[str, ...]:
         """Return warnings about models that are fitted to the rows of the cell."""
         return (MEASURED_JOINTS,) if self.document.joint_values == "measured" else ()
 
-    def plan_settings(self, facts: CellFacts, **changed: Any) -> PlanSettings:
+    def plan_settings(self, facts: CellFacts, **overrides: Any) -> PlanSettings:
         """Return the settings of the next plan: few poses if a model has to be checked, and new poses in every plan.
 
         Args:
             facts: facts about the cell.
-            **changed: values that override the file, by its keys.
+            **overrides: values that override the file, by its keys.
         """
-        settings: PlanSettings = self.settings_of_step("plan", **changed)
-        stated = self.stated_values("plan").keys() | changed.keys()
+        settings: PlanSettings = self.settings_of_step("plan", **overrides)
+        stated = self.stated_values("plan").keys() | overrides.keys()
         default: dict[str, Any] = {"seed": settings.seed + len(facts.plans)}
         if is_check_due(facts):
             default |= {"count": VERIFICATION_POSES, "check": 0}

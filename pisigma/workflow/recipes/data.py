@@ -15,7 +15,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.robot.description import Robot
 from pisigma.simulation.camera.simulated_images import SimulatedImages, write_images
-from pisigma.simulation.measure import SimulatedMeasurements, SimulatedPoses
+from pisigma.simulation.measure import SimulatedPoses, SimulatedTracker
 from pisigma.simulation.measure import simulate as measure
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
@@ -92,19 +92,19 @@ def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None
     return RecipeData(robot, *read_rows(data, robot).split_sets(), fold_settings=recipe.data)
 
 
-def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
+def simulate(recipe: Recipe, simulation_count: int = 1) -> RecipeData:
     """Simulate training and held-out rows of a recipe on its true robot.
 
     Args:
         recipe: a recipe for simulated data.
-        repeats: number of repeats, each with different seeds.
+        simulation_count: number of simulations, each with different seeds.
 
     Raises:
         RecipeError: the recipe is for measured data.
         RobotError: the robot of the recipe cannot be used.
     """
     robot, stated, simulations = Robot.load(recipe.robot), simulated_data(recipe), []
-    for repeat in range(repeats):
+    for repeat in range(simulation_count):
         data = with_other_seeds(stated, repeat)
         true = TrueRobot(robot, data.errors)
         simulations.append((data.training.measure(true), data.held_out.measure(true)))
@@ -127,7 +127,7 @@ def simulate_at(recipe: Recipe, joint_file: str | os.PathLike[str]) -> tuple[Rob
     """
     data, robot = simulated_data(recipe), Robot.load(recipe.robot)
     tracker = data.training
-    if not isinstance(tracker, SimulatedMeasurements):
+    if not isinstance(tracker, SimulatedTracker):
         raise RecipeError(
             expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit --at"
         )

@@ -128,7 +128,7 @@ def _where_checks(keys: Key, section: SimulatedPoses, robot: Robot) -> Iterator[
         yield (*keys, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:
         none = torch.zeros(0, 4, 4, dtype=torch.float64)  # without poses, only the names are checked
-        yield (*keys, "branch"), partial(section.branch.start, robot, none)
+        yield (*keys, "branch"), partial(section.branch.start_joints, robot, none)
 
 
 def _check_joints(names: Sequence[str], valid: Sequence[str], taken: Sequence[str]) -> None:

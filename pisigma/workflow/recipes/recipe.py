@@ -11,7 +11,7 @@ from pisigma.estimation.loss import HampelLoss, SquaredLoss
 from pisigma.files.yaml_file import Section, Seed
 from pisigma.network.sections import FitSection, NetworkSection
 from pisigma.robot.description import Robot
-from pisigma.simulation.measure import SimulatedMeasurements, SimulatedPoses
+from pisigma.simulation.measure import SimulatedPoses, SimulatedTracker
 from pisigma.simulation.true_robot import ErrorSource
 from pisigma.validation.held_out.training_summary import BeforeAfter
 
@@ -45,7 +45,7 @@ class SimulatedData(Section):
     kind: Literal["simulated"]
     errors: tuple[ErrorSource, ...]
     training: SimulatedPoses
-    held_out: SimulatedMeasurements
+    held_out: SimulatedTracker
 
 
 class MeasuredData(Section):
@@ -171,7 +171,7 @@ class GeometricRecipe(AbstractRecipe):
     kind: Literal["geometric_calibration"]
     errors: tuple[ErrorSource, ...]
     measurements: SimulatedPoses
-    held_out: SimulatedMeasurements
+    held_out: SimulatedTracker
     calibration: CalibrationSection = CalibrationSection()
     paper: dict[str, float | int | str | list[str] | list[list[str]]] = Field(default_factory=dict)
 

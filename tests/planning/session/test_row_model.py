@@ -26,24 +26,24 @@ def of_right_rows():
 
 def test_correct_rows_have_usual_probabilities(of_right_rows):
     assert float(of_right_rows.p_value.min()) > 5e-3
-    assert 1.0 <= of_right_rows.scale < 1.5
-    assert float(of_right_rows.length.max()) < 3e-3
-    assert bool(of_right_rows.angle.isnan().all())
-    assert_close(of_right_rows.position.norm(dim=1), of_right_rows.length, rtol=1e-12)
+    assert 1.0 <= of_right_rows.error_scale < 1.5
+    assert float(of_right_rows.length_error.max()) < 3e-3
+    assert bool(of_right_rows.angle_error.isnan().all())
+    assert_close(of_right_rows.position_error.norm(dim=1), of_right_rows.length_error, rtol=1e-12)
 
 
 def test_a_held_out_row_is_predicted_as_if_it_had_not_been_measured(of_right_rows):
     kept = torch.arange(14) != 6
     without = leave_one_out(ROWS, kept)
-    assert_close(without.position[6], of_right_rows.position[6], atol=2e-5)
+    assert_close(without.position_error[6], of_right_rows.position_error[6], atol=2e-5)
 
 
 def test_the_prediction_does_not_depend_on_a_row_that_is_not_kept():
     kept = torch.arange(14) != 6
     away = with_offset(ROWS, 6, (0.3, -0.5, 0.2))
     there, here = leave_one_out(away, kept), leave_one_out(ROWS, kept)
-    assert_close(there.position[6] - here.position[6], [0.3, -0.5, 0.2], atol=1e-5)
-    assert_close(there.position[kept], here.position[kept], atol=1e-6)
+    assert_close(there.position_error[6] - here.position_error[6], [0.3, -0.5, 0.2], atol=1e-5)
+    assert_close(there.position_error[kept], here.position_error[kept], atol=1e-6)
     assert float(there.p_value[6]) < 1e-12
 
 
@@ -59,4 +59,4 @@ def test_two_positions_are_too_few():
 def test_the_scale_of_a_robot_with_larger_errors_than_its_class():
     assert ROWS.position is not None
     noise = torch.from_numpy(np.random.default_rng(0).normal(size=(14, 3))) * 5e-3
-    assert leave_one_out(Measurements(q=ROWS.q, position=ROWS.position + noise)).scale > 3
+    assert leave_one_out(Measurements(q=ROWS.q, position=ROWS.position + noise)).error_scale > 3

@@ -48,7 +48,7 @@ def test_images_without_errors_give_the_poses_of_the_camera(recipe: GeometricRec
 
 def test_views_are_near_oblique_and_from_the_printed_side(recipe: GeometricRecipe, robot: TrueRobot):
     section = images(recipe)
-    T = robot.forward(section.joints_read(robot))
+    T = robot.forward(section.joint_readings(robot))
     off = torch.from_numpy(section.board.board().corners.mean(0)) - T[:, :3, 3]
     assert (off[:, 2] > 0).all()
     assert ((off.norm(dim=1) > 0.3) & (off.norm(dim=1) < 0.7)).all()
@@ -80,9 +80,9 @@ def test_errors_of_board_and_camera_move_the_poses(
 
 def test_joints_are_read_late(recipe: GeometricRecipe, robot: TrueRobot):
     late = images(recipe, late_joints={"delay_ms": 10.0, "speed_deg_per_s": 20.0})
-    off = np.rad2deg((late.joints_read(robot) - images(recipe).joints_read(robot)).numpy())
+    off = np.rad2deg((late.joint_readings(robot) - images(recipe).joint_readings(robot)).numpy())
     assert_close(off.std(), 0.2, atol=0.06)
-    assert_close(late.measure(robot).q, late.joints_read(robot))
+    assert_close(late.measure(robot).q, late.joint_readings(robot))
 
 
 def test_rendered_images_are_those_of_the_poses(recipe: GeometricRecipe, robot: TrueRobot):
@@ -94,7 +94,7 @@ def test_rendered_images_are_those_of_the_poses(recipe: GeometricRecipe, robot: 
     section = images(recipe, camera=half)
     found = detect_checkerboard(next(section.render(robot)), section.board.board())
     assert isinstance(found, DetectedBoard)
-    T_board_camera = robot.forward(section.joints_read(robot))[0].numpy()
+    T_board_camera = robot.forward(section.joint_readings(robot))[0].numpy()
     seen = (section.board.board().corners - T_board_camera[:3, 3]) @ T_board_camera[:3, :3]
     assert_close(found.pixels, section.camera.camera().project(seen)[0], atol=0.1)
 
