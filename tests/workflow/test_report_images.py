@@ -12,6 +12,7 @@ from testing.phone_arm import BOARD, PHONE, arm_before_phone, phone_rows, rows_o
 import pisigma
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.wording import arm_sentence
 from pisigma.validation.report.arm_in_images import arm_in_images
 from pisigma.workflow.report import report
@@ -95,3 +96,10 @@ def test_images_need_their_corners(arm):
     with pytest.raises(MeasurementError) as error:
         report(folder / "model", rows, cameras=cameras, images=[folder / "other"])
     assert error.value.column == "image"
+
+
+def test_images_measure_orientations(arm, tmp_path):
+    model, *_ = arm
+    assert not any(
+        "Orientations were not measured" in line for line in report_content(model, tmp_path).advice
+    )

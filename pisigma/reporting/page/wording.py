@@ -10,7 +10,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.calibration_tables import cross_validation_text, warning_lines
 from pisigma.reporting.rendering import render_sentences
 from pisigma.reporting.result_text import Table
-from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary, has_orientation
 from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.report.accuracy import DOMINANT_SHARE, Accuracy, RowOrigin, ScatterContribution
 from pisigma.validation.report.arm_in_images import ArmInImages
@@ -199,8 +199,9 @@ def _trust(summary: CalibrationSummary) -> tuple[str, ...]:
 
 
 def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[str, ...]:
-    sensors = [noise.sensor for noise in summary.noise]
-    return () if not sensors or "rotation" in sensors or len(model.tools) > 2 else say("no_orientations")
+    return (
+        () if not summary.noise or has_orientation(model) or len(model.tools) > 2 else say("no_orientations")
+    )
 
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
