@@ -43,7 +43,7 @@ from pisigma.validation.report.dependence import (
 )
 from pisigma.validation.report.error_map import ErrorMap, largest_errors, map_of_rows, map_of_workspace
 
-_WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
+_WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature", "payload")
 """Kinds of warnings that name no cause of the errors."""
 
 

@@ -1,4 +1,4 @@
-"""Check whether all rows state a condition, and whether temperatures are plausible in degrees Celsius."""
+"""Check whether all rows state a condition, and whether payloads and temperatures are plausible in kg and deg C."""
 
 from collections.abc import Iterator
 
@@ -11,6 +11,29 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 _HOT = 60.0
 """Temperature above which a warning is given [deg C]; robots may work at up to 45 deg C, and their housings warm up
 by less than 15 K; 20 deg C is 68 deg F."""
+
+_HEAVY = 200.0
+"""Payload of an arm with a reach of 1 m above which a warning is given [kg]; it grows with the cube of the reach. Arms
+on the market lift less than a half of it: 10 kg at 1.1 m, 300 kg at 2.6 m, 2,300 kg at 3.7 m, 5 kg at 0.4 m (SCARA)."""
+
+
+def check_payload(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn about payloads that look like grams."""
+    rows, largest = checked.rows, _HEAVY * checked.robot.reach**3
+    if rows.payload is None:
+        return
+    heavy = (rows.payload > largest).nonzero()[:, 0].tolist()
+    if heavy:
+        most = int(torch.nan_to_num(rows.payload, nan=-torch.inf).argmax())
+        yield Diagnostic(
+            kind="payload",
+            severity="warning",
+            sentence=f"{rows.place(most)}: {float(rows.payload[most]):.4g} kg is heavy for a robot with a reach of "
+            f"{checked.robot.reach:.2f} m ({len(heavy)} of {rows.rows} rows are above {largest:.3g} kg); check whether "
+            "the values are in grams.",
+            rows=tuple(rows.place(row) for row in heavy),
+            values={"heaviest": rows.place(most), "payload": float(rows.payload[most])},
+        )
 
 
 def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:

@@ -1,4 +1,4 @@
-"""Temperatures in degrees Fahrenheit, and conditions that only some rows state, are warned of."""
+"""Temperatures in degrees Fahrenheit, payloads in grams, and conditions that only some rows state, are warned of."""
 
 from dataclasses import replace
 
@@ -8,21 +8,32 @@ from testing.checked import checked
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.validation.checks.conditions import check_conditions, check_temperature
+from pisigma.validation.checks.check import Check
+from pisigma.validation.checks.conditions import check_conditions, check_payload, check_temperature
 
 
-@pytest.mark.parametrize(("hottest", "findings"), [(35.0, 0), (70.0, 1)])
-def test_hot_rows_are_warned_of(hottest: float, findings: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "check", "largest", "findings"),
+    [
+        ("temperature", check_temperature, 35.0, 0),
+        ("temperature", check_temperature, 70.0, 1),
+        ("payload", check_payload, 5.0, 0),
+        ("payload", check_payload, 5000 * 0.35, 1),
+    ],
+)
+def test_values_of_another_unit_are_warned_of(name: str, check: Check, largest: float, findings: int) -> None:
     simulated = simulate("ur5", rows=30, noise=5e-5)
-    temperature = torch.linspace(20, hottest, 30, dtype=torch.float64)
-    temperature[0] = torch.nan
-    rows = replace(simulated.measurements, temperature=temperature)
-    found = list(check_temperature(checked(GeometricCalibrator(simulated.nominal), rows)))
+    values = torch.linspace(0.3, 1, 30, dtype=torch.float64) * largest
+    values[0] = torch.nan
+    rows = replace(simulated.measurements, **{name: values})
+    found = list(check(checked(GeometricCalibrator(simulated.nominal), rows)))
     assert len(found) == findings
     for diagnostic in found:
-        assert diagnostic.severity == "warning"
-        assert diagnostic.values == {"hottest": rows.place(29), "temperature": 70.0}
-        assert diagnostic.rows == tuple(rows.place(row) for row in range(24, 30))
+        assert (diagnostic.kind, diagnostic.severity) == (name, "warning")
+        assert rows.place(29) in diagnostic.values.values()
+        assert diagnostic.values[name] == largest
+        limit = 60 if name == "temperature" else 200 * simulated.nominal.reach**3
+        assert diagnostic.rows == tuple(rows.place(row) for row in range(30) if values[row] > limit)
 
 
 @pytest.mark.parametrize("name", ["payload", "temperature"])
