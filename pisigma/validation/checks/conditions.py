@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
@@ -33,6 +34,45 @@ def check_payload(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             "the values are in grams.",
             rows=tuple(rows.place(row) for row in heavy),
             values={"heaviest": rows.place(most), "payload": float(rows.payload[most])},
+        )
+
+
+_MIN_SPREAD = 1.0
+"""Standard deviation of the temperatures [K] above which an expansion is estimated; within a smaller one, other changes
+with time are larger."""
+_EXPANDS = 5.0
+"""Ratio of the expansion to its standard deviation above which a warning is given; many effects may resemble it."""
+
+
+def check_expansion(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn about errors in proportion to temperature and distance from the base, which joints cannot correct.
+
+    The errors of positions p from the base are fitted by `alpha (T - mean T) p`.
+    """
+    error = checked.final_errors.get("position")
+    if checked.rows.temperature is None or error is None:
+        return
+    stated = torch.isfinite(error).all(1) & torch.isfinite(checked.rows.temperature)
+    rows, y = checked.rows.select(stated.nonzero()[:, 0]), error[stated].flatten()
+    assert rows.temperature is not None
+    change = (rows.temperature - rows.temperature.mean())[:, None]
+    if not float(change.square().mean().sqrt()) > _MIN_SPREAD:
+        return
+    learned = None if checked.hybrid is None else checked.hybrid.learned
+    bases = (checked.geometric if learned is None else learned.geometry).bases
+    base = torch.from_numpy(np.stack([bases[name][:3] for name in rows.frame]))
+    predicted = (checked.hybrid or checked.geometric).predicted_poses(rows)[:, :3, 3]
+    x = (change * (predicted - base)).flatten()
+    alpha = float(x @ y / x.square().sum().clamp(min=1e-12))
+    sigma = float((y - alpha * x).norm() / (len(x) ** 0.5 * x.norm().clamp(min=1e-6)))
+    if alpha > _EXPANDS * sigma:
+        yield Diagnostic(
+            kind="expansion",
+            severity="warning",
+            sentence=f"Errors grow by {alpha * 1e3:.2g} +- {sigma * 1e3:.1g} mm per metre from the base and kelvin, as "
+            "by thermal expansion of the links (0.012 mm for steel, 0.023 mm for aluminium), which is not corrected "
+            "and not included in predicted errors. Calibrate and work at one temperature.",
+            values={"expansion_per_k": alpha, "sigma": sigma},
         )
 
 

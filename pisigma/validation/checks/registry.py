@@ -6,7 +6,12 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.backlash import with_approach_by_order
 from pisigma.validation.checks.camera import check_camera
 from pisigma.validation.checks.check import Check, CheckedCalibration, RowCheck
-from pisigma.validation.checks.conditions import check_conditions, check_payload, check_temperature
+from pisigma.validation.checks.conditions import (
+    check_conditions,
+    check_expansion,
+    check_payload,
+    check_temperature,
+)
 from pisigma.validation.checks.lag import check_lag
 from pisigma.validation.checks.mixed_rows import check_mixed_rows, check_two_populations
 from pisigma.validation.checks.other_robot import check_other_robot, check_other_robot_of_rows
@@ -42,6 +47,7 @@ _CHECKS: tuple[Check, ...] = (
     check_unexplained,
     check_few_rows,
     check_temperature,
+    check_expansion,
     check_payload,
     check_conditions,
     check_torques,

@@ -9,7 +9,12 @@ from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.validation.checks.check import Check
-from pisigma.validation.checks.conditions import check_conditions, check_payload, check_temperature
+from pisigma.validation.checks.conditions import (
+    check_conditions,
+    check_expansion,
+    check_payload,
+    check_temperature,
+)
 
 
 @pytest.mark.parametrize(
@@ -48,3 +53,17 @@ def test_a_condition_that_only_some_rows_state_is_warned_of(name: str, missing: 
     for diagnostic in found:
         assert diagnostic.cause.startswith(name)
         assert diagnostic.rows == tuple(rows.place(row) for row in range(18, 30))
+
+
+@pytest.mark.parametrize("expansion", [0.0, 12e-6])
+def test_thermal_expansion_of_links_is_warned_of(expansion: float) -> None:
+    simulated = simulate("ur5", rows=80, noise=3e-5)
+    rows = replace(simulated.measurements, temperature=torch.linspace(15, 35, 80, dtype=torch.float64))
+    calibrator = GeometricCalibrator(simulated.nominal)
+    geometry = calibrator.fit(rows).solved.geometry
+    from_base = rows.position - torch.from_numpy(next(iter(geometry.bases.values()))[:3])
+    warm = replace(rows, position=rows.position + expansion * (rows.temperature - 20)[:, None] * from_base)
+    found = list(check_expansion(checked(calibrator, warm)))
+    assert [one.kind for one in found] == ["expansion"] * bool(expansion)
+    for one in found:
+        assert abs(one.values["expansion_per_k"] - expansion) < 4 * one.values["sigma"]
