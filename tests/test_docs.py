@@ -188,6 +188,7 @@ def test_navigation_contains_every_page_once() -> None:
     stated = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     entries = _entries(stated["nav"])
     assert sorted(entries) == sorted(_name(page) for page in PAGES)
+    assert set(entries) - {"index.md"} <= set(re.findall(r"\(([\w/-]+\.md)", _text(DOCS / "index.md")))
 
 
 def test_figures_are_small_used_and_shown_with_their_command() -> None:

@@ -19,6 +19,7 @@ from pisigma.reporting.tables import (
     percent_text,
     pose_table,
 )
+from pisigma.reporting.verdict import rounded_text
 
 _WRAPPED = 24
 """Characters of a text above which its column is wrapped."""
@@ -80,6 +81,7 @@ def _environment() -> jinja2.Environment:
             "distance_table": lambda distances: markdown_table(*distance_table(distances)),
             "p_value": p_text,
             "percent": percent_text,
+            "rounded": rounded_text,
             "table": lambda table: markdown_table(*table),
         },
     )
