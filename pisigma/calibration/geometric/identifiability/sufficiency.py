@@ -346,7 +346,7 @@ def _floating_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
     if not floating:
         return []
     names = " and ".join(f"'{frame}'" for frame in floating)
-    where = f"frame{'s' if len(floating) > 1 else ''} {names}" if any(floating) else "the frame"
+    where = f"frame{'s' if len(floating) > 1 else ''} {names}" if any(floating) else "the measuring frame"
     sentence = (
         f"no measurement in {where} has a stated position, so the pose of the robot's base there is not determined: "
         "predicted positions are correct relative to each other, up to a common rigid motion; measure three positions, "
