@@ -70,7 +70,7 @@ def report(
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())
     else:
         also = f", {len(written)} figures to {figures}" if written else ""
-        print_result(report_text(result, [f"Report written to {out}{also}."]), verbose=False)
+        print_result(report_text(result, [f"Report written to {out}{also}."]), elsewhere="see the page")
     if doubt := report_doubt(result):
         raise AcceptanceError(doubt)
 

@@ -26,6 +26,7 @@ def print_screen(
     closing_sentences: Sequence[str] = (),
     verbose: bool = False,
     next_step: Sequence[str] = (),
+    elsewhere: str = "--verbose",
 ) -> None:
     """Print a result, and repeat the accuracy at the end if it has scrolled off the screen.
 
@@ -37,6 +38,7 @@ def print_screen(
         closing_sentences: sentences about files that were written.
         verbose: print everything.
         next_step: last lines, with the next step of a cell instead of the verdict's.
+        elsewhere: where the user finds the blocks that are not shown, for commands without `--verbose`.
     """
     verdict = replace(verdict, next_step="") if next_step else verdict
     head = [line for label, text in verdict.lines if text for line in wrap_lines([f"{label}: {text}"], "  ")]
@@ -51,7 +53,7 @@ def print_screen(
         elif lines:
             left_out.append(block.name)
     left_out += [] if verbose else [block.name for block in details if _lines(block)]
-    names = f"Not shown: {'; '.join(dict.fromkeys(left_out))} (--verbose)." if left_out else ""
+    names = f"Not shown: {'; '.join(dict.fromkeys(left_out))} ({elsewhere})." if left_out else ""
     lines = [
         *head,
         *cautions,
@@ -72,7 +74,9 @@ def _lines(block: Block) -> list[str]:
     return wrap_lines(block.sentences, block.indent)
 
 
-def print_result(result: ResultText, verbose: bool, next_step: Sequence[str] = ()) -> None:
+def print_result(
+    result: ResultText, verbose: bool = False, next_step: Sequence[str] = (), elsewhere: str = "--verbose"
+) -> None:
     """Print a result; see `print_screen`."""
     print_screen(
         result.verdict,
@@ -82,4 +86,5 @@ def print_result(result: ResultText, verbose: bool, next_step: Sequence[str] = (
         result.closing_sentences,
         verbose,
         next_step,
+        elsewhere,
     )

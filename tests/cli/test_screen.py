@@ -4,9 +4,15 @@ import pytest
 
 from pisigma.cli import progress
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import MAX_LINES, print_screen
+from pisigma.cli.screen import MAX_LINES, print_result, print_screen
 from pisigma.files.progress import completed_fraction, step_name
-from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, numbers_as_ranges
+from pisigma.reporting.result_text import (
+    MAX_ALIKE,
+    Block,
+    ResultText,
+    merge_alike_warnings,
+    numbers_as_ranges,
+)
 from pisigma.reporting.verdict import Verdict, rounded_text, uncapitalised
 
 VERDICT = Verdict("0.12 mm RMS, held out; nominal 1 mm.", "yes, for all: nothing is wrong.", "verify it.")
@@ -36,6 +42,12 @@ def test_what_has_no_room_is_named_and_shown_on_demand(capsys):
     whole = printed(capsys, *blocks, verbose=True)
     assert whole.count("line of 4") == 10
     assert whole.count("x") == 9
+
+
+def test_a_command_without_verbose_names_another_way_to_what_has_no_room(capsys):
+    result = ResultText(VERDICT, details=(Block("more", ("x",)),))
+    print_result(result, elsewhere="--json")
+    assert "Not shown: more (--json)." in capsys.readouterr().out
 
 
 def test_warnings_are_never_hidden(capsys):

@@ -150,7 +150,7 @@ def _print_pose(
     if as_json:
         print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
-        print_result(solution_text(solution, solver), verbose=False)
+        print_result(solution_text(solution, solver), elsewhere="--json")
     if problem := failure_sentence(solution, places, one_suffices=all_branches):
         exit_with_error(problem)
 

@@ -199,4 +199,4 @@ def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> No
         print_json({"rest": written, **state.to_json()})
         return
     again = [] if written is None else [f"The remaining poses were planned again: {written}."]
-    print_result(session_text(state, again), verbose=False)
+    print_result(session_text(state, again), elsewhere="--json")

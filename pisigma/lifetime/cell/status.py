@@ -264,7 +264,7 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
             return Step("moved", why, facts.command("plan"))
         if last.verdict != "unchanged":
             return Step("moved", last.summary, facts.command("recalibrate"))
-        why = f"recalibrated with session '{last.session}', the model predicts held-out rows better: {last.summary}"
+        why = f"recalibrating with session '{last.session}' improves the prediction of held-out rows: {last.summary}"
         return Step("older_than_evidence", why, facts.command("recalibrate"))
     if last.verdict in failed and not any(one.made >= last.checked for one in facts.models):
         return _calibrate(facts, "verification_failed", last.summary)
