@@ -95,7 +95,7 @@ def amplitudes(both: RefinedFit, prior: GaussianPrior) -> GaussianPrior:
             sine, cosine = weight.chunk(2, 1)
             size = ((sine.square() + cosine.square()) / 2).repeat(1, 2)
             precision[place.start + shift : place.stop + shift] = 1 / size[feature.used]
-    return replace(prior, unit_precision=precision * prior.sizes[prior.group].square())
+    return replace(prior, unit_precision=precision * prior.group_scales[prior.group].square())
 
 
 def error(solved: SolvedCalibration, refined: RefinedFit, rows: Measurements) -> float:
@@ -124,7 +124,7 @@ def main() -> None:
     solved, solved_both = (GeometricCalibrator(robot).solve(rows) for rows in (c, together(c, b)))
     own, both = fitted(solved, features), fitted(solved_both, features)
     print(f"prior scales from series C                  {error(solved, own, b):.3f}", flush=True)
-    known = replace(own.posterior.prior, sizes=both.posterior.prior.sizes)
+    known = replace(own.posterior.prior, group_scales=both.posterior.prior.group_scales)
     at_best = fitted(solved, features, known)
     print(f"prior scales from both series               {error(solved, at_best, b):.3f}", flush=True)
     at_best = fitted(solved, features, amplitudes(both, known))

@@ -93,7 +93,9 @@ def judged(case: Case) -> Judged:
     )
     one = Judged(geometric, hybrid, errors_with_predicted_sigma(result, case.test))
     print_line(
-        case.name, one, f"{seconds:5.1f} s  {[trial.name for trial in result.trials if trial.kept][-1]}"
+        case.name,
+        one,
+        f"{seconds:5.1f} s  {[trial.name for trial in result.trials if trial.is_best_so_far][-1]}",
     )
     return one
 

@@ -171,7 +171,7 @@ def report_branches(rows: int, starts: int = 40) -> None:
     took = (time.perf_counter() - start) / rows * 1e6
     begun = draw_joints(model.robot, rows * starts, rng).reshape(rows * starts, 6)
     arm = NumericArm(model.robot, model.identified, model.hybrid, kernels.task_axes)
-    q, reached = arm.reach(torch.from_numpy(np.repeat(T, starts, 0)), begun)
+    q, reached = arm.iterate_to_poses(torch.from_numpy(np.repeat(T, starts, 0)), begun)
     off = np.sin((q.numpy().reshape(rows, starts, 1, 6) - every.q[:, None]) / 2)
     missed = np.nan_to_num(np.abs(off).max(-1), nan=1.0).min(-1) > 1e-4
     searched = reached.numpy().reshape(rows, starts)

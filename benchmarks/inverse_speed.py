@@ -70,7 +70,9 @@ def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> C
     correction = JointCorrection(robot, features, (2, 2))
     with torch.no_grad():
         for weight, chosen in zip(correction.linear, features, strict=True):
-            weight.copy_(5e-4 / math.sqrt(chosen.count) * torch.from_numpy(rng.normal(size=weight.shape)))
+            weight.copy_(
+                5e-4 / math.sqrt(chosen.column_count) * torch.from_numpy(rng.normal(size=weight.shape))
+            )
         correction.weight.copy_(0.01 * torch.from_numpy(rng.normal(size=correction.weight.shape)))
     starts = draw_joints(robot, 400, rng)
     arm = HybridArm(geometric, correction.requires_grad_(False), JointCoverage.from_joints(robot, starts))

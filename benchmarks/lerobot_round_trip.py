@@ -148,7 +148,7 @@ def round_trip(python: str, folder: Path) -> None:
     shown = np.array(found["after"]) - np.array(found["before"])
     error = np.abs(shown[:, :5] - ZEROS * 4096 / 4095).max()
     print(f"zeros by LeRobot's own conversion: largest error {error:.3f} deg")
-    offset = result.corrections["action"].offset
+    offset = result.corrections["action"].value_offsets
     moved = max(np.abs(np.array(rows) - offset).max() for rows in found["moved"].values())
     means = max(np.abs(np.array(mean) - offset).max() for mean in found["statistics"].values())
     print(

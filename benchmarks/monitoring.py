@@ -131,7 +131,10 @@ def main() -> None:
                 session, _ = judge_session(model, posterior, moved(rest.select(chosen), joint, tracker))
                 right += is_right(session, joint)
             seconds = (time.perf_counter() - begun) / draws
-            hidden = ", ".join(str(k) for k, seen in enumerate(session.observable, 1) if not seen) or "none"
+            hidden = (
+                ", ".join(str(k) for k, seen in enumerate(session.zero_is_observable, 1) if not seen)
+                or "none"
+            )
             place = "moved" if tracker else "fixed"
             print(
                 f"{name:5} {count:4} {place:7} {joint or 'none':>6} {right / draws:6.1%} {seconds:8.2f}  {hidden}",

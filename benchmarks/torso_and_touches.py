@@ -168,7 +168,7 @@ class Torso:
             for one, own in zip(zip(self.nominal, self.free, strict=True), rows, strict=True)
         ]
         arms = [
-            ArmPosterior(name, uncertainty_of(fit), torso=("waist",))
+            ArmPosterior(name, uncertainty_of(fit), torso_joints=("waist",))
             for name, fit in zip(ARMS, fits, strict=True)
         ]
         return rows, fits, fit_arm_bases(arms)
@@ -207,7 +207,7 @@ def compare_torso(sets: int) -> None:
         values = torso.drawn(rng)
         _, _, found = torso.fitted(torso.true(values, IN_HALL), rng)
         right = found.updated_arms[1]
-        base = list(right.base_rows("hall"))
+        base = list(right.base_indices("hall"))
         J = torch.func.jacrev(lambda one: pose_error(transform_from_xyz_zyx(one), where))(right.values[base])
         names = [right.space.index(name) for name in torso.branch]
         offsets = right.values[names].numpy() - torso.nominal[1].dh[0, :2] - values[1][-2:]

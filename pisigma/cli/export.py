@@ -165,7 +165,12 @@ def _print(exported: "Exported", form: str, out: Path, title: str, as_json: bool
     else:
         for line in exported.leading_text.splitlines():
             print_line(line)
-        print_lines([*exported.remarks, f"{exported.summary or title} written to {out}{exported.details}."])
+        print_lines(
+            [
+                *exported.remarks,
+                f"{exported.sentence_start or title} written to {out}{exported.sentence_end}.",
+            ]
+        )
     if exported.failure:
         exit_with_error(exported.failure)
     if exported.missed_limit:

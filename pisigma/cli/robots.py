@@ -173,7 +173,7 @@ def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None
 
 def _pendant_row(pose: "PendantPose") -> tuple[str, ...]:
     """Return the table cells of a pose."""
-    at = f"{pose.in_file_unit:g} {pose.axis.file_unit}" if pose.axis else "0"
+    at = f"{pose.axis_value_in_file_unit:g} {pose.axis.file_unit}" if pose.axis else "0"
     numbers = (f"{value + 0.0:.2f}" for value in pose.tool_in_file_units.values())
     return (
         pose.axis.name if pose.axis else "-",

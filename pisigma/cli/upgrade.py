@@ -1,7 +1,5 @@
 """`pisigma upgrade`: convert a model folder or a cell of an earlier version."""
 
-from dataclasses import asdict
-
 from pisigma.cli.arguments import AsJson, ModelOrCell
 from pisigma.cli.output import print_json, print_lines
 
@@ -13,7 +11,10 @@ def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
 
     done = workflow(model)
     before, after = done.schema_before, done.schema_after
-    models = [asdict(one) for one in done.models]
+    models = [
+        {"name": one.name, "before": one.format_before, "after": one.format_after, "changes": one.changes}
+        for one in done.models
+    ]
     if as_json and is_cell(model):
         print_json({"cell": str(model), "before": before, "after": after, "models": models})
     elif as_json:
@@ -25,8 +26,10 @@ def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
             print_lines([f"The history of {model} already has the newest schema version ({after})."])
         for one in done.models:
             name = f"model '{one.name}'" if is_cell(model) else str(model)
-            if one.before == one.after:
+            if one.format_before == one.format_after:
                 print_lines([f"{name}: {change}" for change in one.changes])
-                print_lines([f"{name} already has the newest format ({one.after})."])
+                print_lines([f"{name} already has the newest format ({one.format_after})."])
             else:
-                print_lines([f"{name}: format {one.before} was upgraded to {one.after}.", *one.changes])
+                print_lines(
+                    [f"{name}: format {one.format_before} was upgraded to {one.format_after}.", *one.changes]
+                )

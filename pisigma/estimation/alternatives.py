@@ -241,12 +241,14 @@ class SessionEvidence:
         self._sigma = values.sigma(usual_noise)
         self._scaled = ~values.has_exact_noise
         self._groups = tuple(hypotheses)
-        self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
+        self._Z = [
+            compressed_columns(values.X[:, one.index] * one.sigma_at_unit_size) for one in self._groups
+        ]
 
-    def with_wrong_rows(self, wrong_rows: Mapping[int, float]) -> "SessionEvidence":
+    def with_wrong_configurations(self, wrong_configurations: Mapping[int, float]) -> "SessionEvidence":
         """Return the evidence with other `LinearValues.wrong_configurations`."""
         other = copy(self)
-        other.values = replace(self.values, wrong_configurations=wrong_rows)
+        other.values = replace(self.values, wrong_configurations=wrong_configurations)
         other._sigma = other.values.sigma(self._usual_noise)
         return other
 

@@ -18,18 +18,18 @@ class ImplicitCovarianceRoot:
     1165-1166) for all values at once.
 
     Attributes:
-        size: prior standard deviation of every weight, the diagonal of D.
+        prior_sigma: prior standard deviation of every weight, the diagonal of D.
         Z: derivatives of the values with respect to the weights, multiplied by D and divided by the noise.
         factor: L, lower triangular.
     """
 
-    size: Float64[Tensor, " weights"]
+    prior_sigma: Float64[Tensor, " weights"]
     Z: Float64[Tensor, "values weights"]
     factor: Float64[Tensor, "values values"]
 
     def left_multiply(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
         """Return the product `columns @ root`."""
-        scaled = columns.flatten(0, -2) * self.size
+        scaled = columns.flatten(0, -2) * self.prior_sigma
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(self.factor, self.Z @ scaled.t(), upper=False)
         inner = torch.linalg.solve_triangular(once.t(), inner, upper=True)
@@ -43,7 +43,7 @@ class ImplicitCovarianceRoot:
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(once, self.Z @ matrix, upper=False)
         inner = torch.linalg.solve_triangular(self.factor.t(), inner, upper=True)
-        result: Tensor = self.size[:, None] * (matrix - self.Z.t() @ inner)
+        result: Tensor = self.prior_sigma[:, None] * (matrix - self.Z.t() @ inner)
         return result
 
 
@@ -85,7 +85,7 @@ class CovarianceRoot:
         """R as a matrix."""
         if self.weights is None:
             return self.directions
-        count = len(self.weights.size)
+        count = len(self.weights.prior_sigma)
         below = self.weights.left_multiply(torch.eye(count).to(self.directions))
         above = self.directions.new_zeros((len(self.directions) - count, count))
         return torch.cat([self.directions, torch.cat([above, below])], 1)
@@ -97,7 +97,7 @@ class CovarianceRoot:
         # one product of two matrices, because torch would read R once for every row of a non-contiguous view
         result = columns.flatten(0, -2) @ self.directions
         if self.weights is not None:
-            first = self.directions.shape[0] - len(self.weights.size)
+            first = self.directions.shape[0] - len(self.weights.prior_sigma)
             result = torch.cat([result, self.weights.left_multiply(columns.flatten(0, -2)[:, first:])], -1)
         return result.reshape(*columns.shape[:-1], result.shape[-1])
 
@@ -107,7 +107,7 @@ class CovarianceRoot:
         """Return the product `C @ matrix` with the covariance C."""
         result = self.directions @ (self.directions.t() @ matrix)
         if self.weights is not None:
-            first = len(result) - len(self.weights.size)
+            first = len(result) - len(self.weights.prior_sigma)
             result[first:] += self.weights.right_multiply(self.weights.left_multiply(matrix[first:].t()).t())
         return result
 
@@ -131,7 +131,9 @@ class CovarianceRoot:
             directions[parameters:, place] = block[active:]
         directions.mul_(sigma_factor)
         few = self.weights
-        return CovarianceRoot(directions, None if few is None else replace(few, size=few.size * sigma_factor))
+        return CovarianceRoot(
+            directions, None if few is None else replace(few, prior_sigma=few.prior_sigma * sigma_factor)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +146,7 @@ class ConditionedUnknowns:
         z_root: root of the covariance of z, in the directions (z, e) of the prior.
         x_root: root of the covariance of x, in the same directions.
         misfit: `|z|² + |e|²` at the solution, which has a chi-squared distribution.
-        redundancy: degrees of freedom of the misfit, the number of equations that x does not absorb.
+        degrees_of_freedom: degrees of freedom of the misfit, the number of equations that x does not absorb.
     """
 
     z: Float64[Tensor, " directions"]
@@ -152,7 +154,7 @@ class ConditionedUnknowns:
     z_root: Float64[Tensor, "directions prior"]
     x_root: Float64[Tensor, "unknowns prior"]
     misfit: float
-    redundancy: int
+    degrees_of_freedom: int
 
 
 def condition_on_equalities(

@@ -27,13 +27,13 @@ NOISE_SPREAD = 0.3
 
 @dataclass(frozen=True, eq=False)
 class DriftGroup:
-    """Unknowns that drift together, independently of each other, with the standard deviation `size · scale`.
+    """Unknowns that drift together, independently of each other, with a common `drift_size`.
 
     Attributes:
         name: name of the group, such as "joint 3", "base" or "correction".
         index: indices of the unknowns of the group.
-        scale: standard deviation of every unknown at size 1 [m or rad].
-        size: size of the drift; 0 if the group has not drifted.
+        sigma_at_unit_size: standard deviation of every unknown at size 1 [m or rad]; it is proportional to the size.
+        drift_size: size of the drift; 0 if the group has not drifted.
         fixed_size: whether the size is stated rather than estimated, as for a base that was relocated.
         log_prior_penalty: increase of the log evidence that a drift of the group requires [nats].
         is_one_motion: whether the group is one motion rather than a set of many independent changes.
@@ -41,8 +41,8 @@ class DriftGroup:
 
     name: str
     index: Int64[Tensor, " members"]
-    scale: Float64[Tensor, " members"]
-    size: float = 0.0
+    sigma_at_unit_size: Float64[Tensor, " members"]
+    drift_size: float = 0.0
     fixed_size: bool = False
     log_prior_penalty: float = LOG_PRIOR_PENALTY
     is_one_motion: bool = True
@@ -50,7 +50,7 @@ class DriftGroup:
     @property
     def sigma(self) -> Float64[Tensor, " members"]:
         """Standard deviation of every unknown's drift [m or rad]."""
-        return self.size * self.scale
+        return self.drift_size * self.sigma_at_unit_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,22 +145,22 @@ class DriftSearch:
         """
         self.values, self._K = values, A @ A.t()
         self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
-        self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in groups]
+        self._Z = [compressed_columns(values.X[:, one.index] * one.sigma_at_unit_size) for one in groups]
         self.covariance = self._K + self.sigma.square().diag()
         for one, Z in zip(self._groups, self._Z, strict=True):
-            self.covariance += one.size**2 * Z @ Z.t()
+            self.covariance += one.drift_size**2 * Z @ Z.t()
 
     def estimate_sizes(self, sweeps: int = _MAX_SWEEPS) -> None:
         """Estimate sizes and noise, one group and one sensor at a time."""
         for _ in range(sweeps):
-            before = [one.size for one in self._groups]
+            before = [one.drift_size for one in self._groups]
             for number, group in enumerate(self._groups):
                 if not group.fixed_size:
                     self._resize(number, self._best_size(number))
             for sensor, count in enumerate(self.values.sensor_counts):
                 if not count.has_exact_noise and count.values:
                     self._update_noise(sensor, 1.0 if count.has_stated_noise else 0.0)
-            if before == [one.size for one in self._groups]:
+            if before == [one.drift_size for one in self._groups]:
                 break
 
     @property
@@ -193,9 +193,10 @@ class DriftSearch:
         group, (_, a, W) = self._groups[group_index], self._whitened(group_index, reduced=False)
         normal = W.t() @ W
         if with_prior:
-            normal.diagonal().add_(group.size**-2)
+            normal.diagonal().add_(group.drift_size**-2)
         covariance = torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
-        return (covariance @ (W.t() @ a)) * group.scale, covariance * group.scale * group.scale[:, None]
+        scale = group.sigma_at_unit_size
+        return (covariance @ (W.t() @ a)) * scale, covariance * scale * scale[:, None]
 
     def _best_size(self, number: int) -> float:
         raised = evidence_gains(SIZES, *self._coordinates(number))
@@ -210,9 +211,9 @@ class DriftSearch:
     def _whitened(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """Return a group's columns, and values and columns in the metric of all other terms."""
         group, Z, y = self._groups[number], self._Z[number], self.values.y
-        V = self.covariance - group.size**2 * Z @ Z.t()
+        V = self.covariance - group.drift_size**2 * Z @ Z.t()
         if not reduced:
-            Z = self.values.X[:, group.index] * group.scale
+            Z = self.values.X[:, group.index] * group.sigma_at_unit_size
         both = torch.linalg.solve_triangular(
             covariance_cholesky(V), torch.cat([y[:, None], Z], 1), upper=False
         )
@@ -220,8 +221,8 @@ class DriftSearch:
 
     def _resize(self, number: int, size: float) -> None:
         group, Z = self._groups[number], self._Z[number]
-        self.covariance += (size**2 - group.size**2) * Z @ Z.t()
-        self._groups[number] = replace(group, size=size)
+        self.covariance += (size**2 - group.drift_size**2) * Z @ Z.t()
+        self._groups[number] = replace(group, drift_size=size)
 
     def _update_noise(self, sensor: int, least: float) -> None:
         """Update the noise of a sensor with the factor of highest evidence on its usual noise (log-normal prior)."""
@@ -242,7 +243,7 @@ class DriftSearch:
     def _log_evidence(self, V: Tensor) -> float:
         factor = covariance_cholesky(V)
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
-        estimated = [one for one in self._groups if one.size > 0 and not one.fixed_size]
+        estimated = [one for one in self._groups if one.drift_size > 0 and not one.fixed_size]
         odds = self.values.log_prior_penalty + sum(one.log_prior_penalty for one in estimated)
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
@@ -302,7 +303,7 @@ class PosteriorUpdate:
             drift: drift since the root was estimated, and noise of the values.
         """
         self._root = root
-        drifted = [group for group in drift.groups if group.size > 0]
+        drifted = [group for group in drift.groups if group.drift_size > 0]
         index = torch.cat([group.index for group in drifted] or [torch.zeros(0, dtype=torch.int64)])
         deviation = torch.cat([group.sigma for group in drifted] or [values.y[:0]])
         self._index, self._deviation = index, deviation

@@ -67,7 +67,9 @@ class DualRegression(AbstractRegression):
         determined = prior.sum_by_group(held)
         # Both matrices are symmetric, so the trace of their product requires only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
-        determined[prior.class_count :] = prior.sizes[prior.class_count :].square() * traces
+        determined[prior.geometric_class_count :] = (
+            prior.group_scales[prior.geometric_class_count :].square() * traces
+        )
         # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
@@ -116,13 +118,13 @@ class DualRegression(AbstractRegression):
     def is_ill_conditioned(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
         """Return whether traces of P cancel because the noise is very small; normal equations are then accurate."""
         diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
-        trace = float(prior.sizes[prior.class_count :].square() @ self.K[:, diagonal].sum(1))
+        trace = float(prior.group_scales[prior.geometric_class_count :].square() @ self.K[:, diagonal].sum(1))
         return trace > _MAX_VARIANCE_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
         """Return V, of which only the upper triangle is set."""
         V = self.y.new_zeros((len(self.y), len(self.y)))
-        V.view(-1)[self._pairs] = prior.sizes[prior.class_count :].square() @ self.K
+        V.view(-1)[self._pairs] = prior.group_scales[prior.geometric_class_count :].square() @ self.K
         V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
         return V
 

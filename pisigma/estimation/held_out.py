@@ -23,12 +23,12 @@ class HeldOutErrors:
 
     Attributes:
         error: measured minus predicted value.
-        spread: predicted standard deviation of the error, from parameters and noise.
+        predicted_sigma: predicted standard deviation of the error, from parameters and noise.
         sensor: index of every value's sensor.
     """
 
     error: Float64[Tensor, " values"]
-    spread: Float64[Tensor, " values"]
+    predicted_sigma: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
 
     @staticmethod
@@ -65,14 +65,16 @@ class HeldOutErrors:
     @staticmethod
     def concatenate(parts: "Sequence[HeldOutErrors]") -> "HeldOutErrors":
         """Concatenate the errors of several folds."""
-        names = ("error", "spread", "sensor")
+        names = ("error", "predicted_sigma", "sensor")
         return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     def rms(self, noise: Sequence[float], reference_sigmas: Sequence[float]) -> float:
         """Return the RMS error relative to given standard deviations, such as the noise of another model."""
         return float(self._squares(noise, reference_sigmas).mean().sqrt())
 
-    def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:
+    def gain_in_standard_errors(
+        self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]
+    ) -> float:
         """Return the decrease of the squared errors relative to another fit, in standard errors."""
         return sum_in_standard_errors(
             before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
@@ -95,7 +97,7 @@ def held_out_covariance_factor(errors: HeldOutErrors) -> float:
     With errors e and predicted standard deviations s in units of the noise, it solves
     `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make the factor larger than 1.
     """
-    square, extra = errors.error.square(), errors.spread.square() - 1
+    square, extra = errors.error.square(), errors.predicted_sigma.square() - 1
     low, high = 0.0, math.log(MAX_SCALE)
     if float((square / (1 + extra)).mean()) <= 1:
         return 1.0
@@ -118,16 +120,16 @@ class RowTest:
 
     Attributes:
         row: index of the row.
-        probability: probability that the error of any row is at least this improbable if none is wrong (Bonferroni).
+        p_value: probability that the error of any row is at least this improbable if none is wrong (Bonferroni).
     """
 
     row: int
-    probability: float
+    p_value: float
 
     @property
     def is_wrong(self) -> bool:
         """Whether the other rows contradict the row."""
-        return self.probability < _LEVEL
+        return self.p_value < _LEVEL
 
 
 def most_deviating_row(
@@ -169,6 +171,6 @@ def most_deviating_row(
         gain = float(((vectors.t() @ y[chosen])[certain].square() / values[certain]).sum())
         ratio = (gain / count) / max((total - gain) / (freedom - count), 1e-300)
         probability = min(1.0, len(numbers) * float(f_distribution.sf(ratio, count, freedom - count)))
-        if worst is None or probability < worst.probability:
+        if worst is None or probability < worst.p_value:
             worst = RowTest(int(number), probability)
     return worst

@@ -29,7 +29,7 @@ class SolvedRegression:
         prior: prior of the unknowns.
         noise: standard deviation for every sensor.
         scale: diagonal of D.
-        inverse: L^-1, lower triangular, so that the covariance is `D L^-T L^-1 D`.
+        inverse_factor: L^-1, lower triangular, so that the covariance is `D L^-T L^-1 D`.
         log_det: logarithm of the determinant of `Σ X^T X / noise² + precision`.
         x: most probable values.
     """
@@ -37,21 +37,23 @@ class SolvedRegression:
     prior: GaussianPrior
     noise: tuple[float, ...]
     scale: Float64[Tensor, " unknowns"]
-    inverse: Float64[Tensor, "unknowns unknowns"]
+    inverse_factor: Float64[Tensor, "unknowns unknowns"]
     log_det: float
     x: Float64[Tensor, " unknowns"]
 
     @property
     def variance(self) -> Float64[Tensor, " unknowns"]:
         """Variance of every unknown, the diagonal of the covariance."""
-        deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
+        deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse_factor, dim=0)
         return deviation.square()
 
     def trace_of_product(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
         """Return the trace of a symmetric matrix times the covariance, which is computed block by block."""
         trace = 0.0
         for rows in row_blocks(len(self.x), BLOCK):
-            block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
+            block = (
+                self.inverse_factor[rows.start :, rows].t() @ self.inverse_factor[rows.start :, : rows.stop]
+            )
             scale = self.scale[: rows.stop].clone()
             scale[: rows.start].mul_(2)  # counts the blocks above the diagonal as well
             trace += float(self.scale[rows] @ (block.mul_(matrix[rows, : rows.stop]) @ scale))
@@ -100,7 +102,7 @@ class PrimalRegression(AbstractRegression):
         """Return the covariance root of the unknowns: `D L^-T` with the names of `SolvedRegression`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
         self.latest_solution.clear()
-        return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
+        return CovarianceRoot(solved.inverse_factor.t().mul_(solved.scale[:, None]))
 
     def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> SolvedRegression:
         """Return the cached solution if prior and noise are unchanged, otherwise a new solution."""
@@ -120,7 +122,7 @@ class PrimalRegression(AbstractRegression):
             release_free_memory(len(prior.unit_precision))
             # The matrix may take gigabytes, so the memory of the previous factor is reused.
             memory = (
-                self.latest_solution.pop().inverse.mT
+                self.latest_solution.pop().inverse_factor.mT
                 if self.latest_solution
                 else torch.empty_like(self.normal[0])
             )

@@ -82,7 +82,7 @@ class AbstractRegression(ABC):
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """Return the covariance root of the unknowns."""
 
-    def effective_share(self, posterior: Posterior) -> float:
+    def absorbed_share(self, posterior: Posterior) -> float:
         """Return the share of the values that the unknowns absorb; if it is near 1, the noise cannot be estimated."""
         values = sum(sensor.values for sensor in self.sensors if not sensor.has_exact_noise)
         return posterior.effective_unknowns / max(values, 1.0)
@@ -134,7 +134,7 @@ def prior_scale_columns(
     them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
     """
     prior, x = posterior.prior, posterior.x
-    groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
+    groups = torch.zeros(len(x), len(prior.group_scales), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
     certain = posterior.determined_unknowns > MIN_EFFECTIVE
     moved = 2 * covariance_root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])

@@ -111,7 +111,7 @@ class ConditionFeatures(AbstractFeature):
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return products of conditions and functions of the joint values; 0 for mean, missing or NaN conditions."""
         if not any(name in state.conditions for name in self.names):
-            return state.q.new_zeros((*state.q.shape, self.count))
+            return state.q.new_zeros((*state.q.shape, self.column_count))
         return self._products(state, self.scaled_conditions(self._stated(state)))
 
     def unstated_covariance_root(

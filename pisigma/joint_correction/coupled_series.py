@@ -45,7 +45,7 @@ class CoupledSeries(AbstractFeature):
         super().__init__(robot)
         coupling = robot.coupling
         axes = len(robot.axes)
-        driven = np.zeros((robot.dof, axes), dtype=bool) if coupling is None else coupling.driven
+        driven = np.zeros((robot.dof, axes), dtype=bool) if coupling is None else coupling.is_factor_stated
         sliding = torch.tensor([0 if turns else 1 for turns in robot.revolute])[:, None]
         self.used = torch.from_numpy(np.tile(driven, (1, 1 + 2 * _HARMONICS)))
         bands = ([2] * LOW + [4] * (_HARMONICS - LOW)) * 2

@@ -165,10 +165,10 @@ class AbstractFeature(ABC):
 
     def columns_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
         """Return the indices of this feature's columns in a feature of the same name and at least the same size."""
-        return torch.arange(self.count).expand(self.used.shape)
+        return torch.arange(self.column_count).expand(self.used.shape)
 
     @property
-    def count(self) -> int:
+    def column_count(self) -> int:
         """Number of columns per joint."""
         return self.used.shape[1]
 

@@ -91,7 +91,7 @@ class RowValues:
         return RowValues(numbers, steps, _kinds(robot), file)
 
     @staticmethod
-    def stored_values(
+    def from_stored_numbers(
         numbers: Float64[Tensor, "rows numbers"], rounding_steps: Float64[Tensor, "rows 4"], robot: Robot
     ) -> "RowValues":
         """Return values of rows of one file from stored numbers and steps."""
@@ -113,7 +113,7 @@ class RowValues:
         )
 
     @property
-    def column_steps(self) -> Float64[Tensor, "rows numbers"]:
+    def number_rounding_steps(self) -> Float64[Tensor, "rows numbers"]:
         """Rounding step of every number; the entries of a rotation depend on the steps of all three angles together."""
         return (self.rounding_steps * torch.tensor([1, 1, 1, 3**0.5]))[:, self.step_index]
 
@@ -123,7 +123,7 @@ class RowValues:
         return self.numbers[:, :-ROW_READINGS]
 
     @property
-    def length(self) -> Float64[Tensor, "rows 3"]:
+    def length_coordinates(self) -> Float64[Tensor, "rows 3"]:
         """Measured length in up to three coordinates [SI units]."""
         return self.numbers[:, -ROW_READINGS:-6]
 
@@ -243,7 +243,7 @@ class _SameJoints:
 
     @staticmethod
     def from_values(values: RowValues) -> "_SameJoints":
-        coarsest = values.column_steps[:, : values.q.shape[1]].amax(0)
+        coarsest = values.number_rounding_steps[:, : values.q.shape[1]].amax(0)
         group = torch.unique((values.q / coarsest).round() + 0.0, dim=0, return_inverse=True)[1]
         continues = (group[1:] == group[:-1]) & (values.file_index[1:] == values.file_index[:-1])
         run = torch.cat([torch.zeros(min(len(group), 1), dtype=torch.int64), (~continues).cumsum(0)])
@@ -278,7 +278,7 @@ class _SameJoints:
         logarithms = _chance_of_equal(steps, deviation * 2**0.5).log()
         axes = logarithms[:, values.step_index[: values.q.shape[1]]].sum(1)
         length, angle = logarithms[:, 2], logarithms[:, 3]
-        lengths, has_rotation = values.length.isfinite().sum(1), values.numbers[:, -1].isfinite()
+        lengths, has_rotation = values.length_coordinates.isfinite().sum(1), values.numbers[:, -1].isfinite()
         read = lengths * length + torch.where(has_rotation, 3 * angle, 0.0)
         return torch.where((lengths > 0) | has_rotation, read, axes).exp()
 
@@ -299,7 +299,7 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
 
     Rows are sorted by a weighted sum of their numbers, so that only neighbours need to be compared.
     """
-    numbers, steps = values.numbers, values.column_steps
+    numbers, steps = values.numbers, values.number_rounding_steps
     scale = steps.amax(0)
     # weights without simple ratios
     weight = torch.arange(2.0, 2 + numbers.shape[1]).double().sqrt() % 1 + 0.5

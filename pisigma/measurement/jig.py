@@ -140,7 +140,7 @@ class Jig:
         )
 
     @property
-    def faces(self) -> int:
+    def face_count(self) -> int:
         """Number of faces that may be touched."""
         return len(self.block)
 

@@ -45,7 +45,7 @@ class FieldLabels:
         """Return the name of a field or a sensor in messages."""
         return self.names.get(name, name)
 
-    def format_value(self, name: str, value: float) -> float:
+    def in_message_unit(self, name: str, value: float) -> float:
         """Return an SI value of a field in the unit of messages, with 6 digits."""
         return float(f"{float(from_si(np.array([value]), self.units.get(name, ''))[0]):.6g}")
 
@@ -206,7 +206,7 @@ def _value_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndF
     ):
         values = data.array(name)
         unit = {"temperature": "deg C", "payload": "kg"}.get(name, labels.units.get(name, ""))
-        lower = f"{labels.format_value(name, least):.3g}"
+        lower = f"{labels.in_message_unit(name, least):.3g}"
         expected = (
             f"{lower} {unit} or more".replace("  ", " ")
             if most == math.inf
@@ -214,13 +214,13 @@ def _value_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndF
         )
         formula = " (deg C = K - 273.15 = (deg F - 32) / 1.8)" if unit == "deg C" else ""
         for row in rows_where((values < least) | (values > most)):
-            shown = labels.format_value(name, values[row])
+            shown = labels.in_message_unit(name, values[row])
             yield row, Fault("", labels(name), expected, shown, f"correct it{formula} or leave it empty")
     if "approach" in data.numbers:
         expected = "+1 (the joint value increased) or -1 (it decreased)"
         for joint, values in enumerate(data.array("approach").T, start=1):
             for row in rows_where(~np.isnan(values) & (np.abs(values) != 1)):
-                shown = labels.format_value("approach", values[row])
+                shown = labels.in_message_unit("approach", values[row])
                 yield row, Fault("", labels(f"approach{joint}"), expected, shown, _CORRECT)
     for row, split in enumerate(data.texts.get("split", ())):
         if split not in _SPLITS:
@@ -293,7 +293,7 @@ def _distance_faults(
                 "",
                 column,
                 "a distance of 0 or more",
-                labels.format_value("distance", values[row]),
+                labels.in_message_unit("distance", values[row]),
                 "correct the distance",
             ),
         )
@@ -393,7 +393,7 @@ def _pair_fault(
     for quantity in ("distance", "sigma_position"):
         a, b = data.array(quantity)[rows].tolist()
         if a != b and not (np.isnan(a) and np.isnan(b)):
-            shown = f"{labels.format_value(quantity, a):g} and {labels.format_value(quantity, b):g}"
+            shown = f"{labels.in_message_unit(quantity, a):g} and {labels.in_message_unit(quantity, b):g}"
             problem = f"expected one value of '{labels(quantity)}' in both rows of pair '{name}', got {shown}"
             return Fault(problem, column, value=shown, remedy="give the same value in both rows")
     return None

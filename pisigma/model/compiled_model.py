@@ -52,7 +52,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], model_fo
         branches=branches,
         joints=joints,
         name=model.name,
-        belongs_to=model_folder_hash,
+        model_folder_hash=model_folder_hash,
         warnings=condition_warnings(model),
     )
 

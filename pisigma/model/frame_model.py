@@ -41,20 +41,20 @@ class FittedFrames:
     Attributes:
         fit: the fit.
         model: model with the fitted frames.
-        arm_root: root of the covariance of the fitted coordinates due to the uncertainty of the arm [m and rad], in the
-            directions of the root of the model whose arm was used.
+        arm_covariance_root: root of the covariance of the fitted coordinates due to the uncertainty of the arm [m
+            and rad], in the directions of the root of the model whose arm was used.
         causes: possible causes of the residuals of a hand-eye calibration; see `misfit_causes`.
     """
 
     fit: FrameFit
     model: CalibratedModel
-    arm_root: Float64[Tensor, "frames directions"]
+    arm_covariance_root: Float64[Tensor, "frames directions"]
     causes: tuple[Cause, ...]
 
     @property
-    def arm_variance(self) -> tuple[float, ...]:
+    def variance_due_to_arm(self) -> tuple[float, ...]:
         """Variance of every fitted coordinate due to the uncertainty of the arm [m² or rad²]."""
-        return tuple(self.arm_root.square().sum(1).tolist())
+        return tuple(self.arm_covariance_root.square().sum(1).tolist())
 
 
 def frames_of_robot(robot: Robot, rows: Measurements, frame_choice: FrameChoice) -> FittedFrames:
@@ -119,9 +119,9 @@ def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames d
     `-(X^T X)^-1 X^T X_arm δ`.
     """
     problem = fit.solved.problem
-    spread = known.spread(fit.solved, fit.used_rows, problem.active.tolist())
+    spread = known.value_covariance_root(fit.solved, fit.used_rows, problem.active.tolist())
     change = fit.solved.geometry.coordinate_jacobian[fit.frame_indices][:, problem.active]
-    root: Tensor = -change @ fit.basis @ torch.linalg.pinv(fit.values.X) @ spread
+    root: Tensor = -change @ fit.fitted_directions @ torch.linalg.pinv(fit.values.X) @ spread
     return root
 
 

@@ -84,7 +84,7 @@ def with_hybrid(model: CalibratedModel, result: HybridResult, measurements: Meas
     known, learned = result.geometric, result.learned
     uncertainty = result.uncertainty.with_rounded_root(measurements)
     if learned is None:
-        geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
+        geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.sensor_unknowns)
         return replace(model, uncertainty=replace(uncertainty, geometry=geometry))
     bases, tools = dict(learned.geometry.bases), dict(learned.geometry.tools)
     geometry = IdentifiedGeometry(learned.geometry.robot, bases, tools, learned.geometry.unknowns)

@@ -46,7 +46,7 @@ class StoredStarts:
             count: number of starts per pose; fewer are returned if there are not enough.
             axes: axes of the tool that are constrained.
         """
-        counted = torch.tensor([True] * 3 + 3 * list(axes.directions))
+        counted = torch.tensor([True] * 3 + 3 * list(axes.compared_directions))
         count = min(count, len(self.q))
         chunks, points = torch.split(self.as_points(T)[:, counted], _CHUNK), self.points[:, counted]
         nearest = [torch.cdist(chunk, points).topk(count, largest=False).indices for chunk in chunks]

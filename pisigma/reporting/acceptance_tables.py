@@ -30,11 +30,11 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
         )
     if acceptance.limit_mm is not None:
         lines.append(f"The limit is {acceptance.limit_mm:g} mm.")
-    if measured is not None and measured.fitted:
-        several = len(measured.fitted) > 1
+    if measured is not None and measured.fitted_frames:
+        several = len(measured.fitted_frames) > 1
         lines.append(
-            f"The {' and the '.join(measured.fitted)} {'were' if several else 'was'} fitted to these rows, because "
-            f"{'they were' if several else 'it was'} changed."
+            f"The {' and the '.join(measured.fitted_frames)} {'were' if several else 'was'} fitted to these rows, "
+            f"because {'they were' if several else 'it was'} changed."
         )
     if measured is not None and measured.distrust_reason:
         lines.append(measured.distrust_reason)

@@ -159,7 +159,13 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
 def common_error_table(summary: FleetPriorSummary) -> Table:
     """Return a table of the mean and the standard deviation between robots of every geometric parameter."""
     rows = (
-        (one.name, one.unit, f"{one.mean:z.4f}", f"{one.sigma:.4f}", "in a sum" if one.in_a_sum else "")
+        (
+            one.name,
+            one.unit,
+            f"{one.mean:z.4f}",
+            f"{one.sigma:.4f}",
+            "in a sum" if one.is_determined_only_in_sum else "",
+        )
         for one in summary.parameters
     )
     return Table(("parameter", "unit", "mean", "between robots", "remark"), tuple(rows))

@@ -49,7 +49,7 @@ def fleet_verdict(status: FleetStatus) -> Verdict:
     serious = [state for state in status.states if state in (UNREADABLE, *ATTENTION)]
     count = len(status.cells) + len(status.unreadable)
     found = ", ".join(f"{len(status.states[state])} {state}" for state in serious)
-    due = sum(one.is_due for one in status.cells)
+    due = sum(one.has_automatic_step for one in status.cells)
     first = next((one for one in status.cells if one.step.state == (serious or [""])[-1]), None)
     return Verdict(
         "not known yet for any cell."

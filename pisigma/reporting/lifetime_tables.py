@@ -29,7 +29,7 @@ def chart_table(charts: Sequence[Chart]) -> Table:
 
 def _chart_row(chart: Chart) -> tuple[str, ...]:
     last = float(chart.values[-1])
-    shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_of_limit, chart.cusum_of_limit))
+    shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_to_limit_ratio, chart.cusum_to_limit_ratio))
     value = f"{last:z.4f}" if last == last else "unobservable"
     return (chart.quantity, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
 

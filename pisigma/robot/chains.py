@@ -91,7 +91,7 @@ class PendantPose:
     is_within_limits: bool
 
     @property
-    def in_file_unit(self) -> float:
+    def axis_value_in_file_unit(self) -> float:
         """Controller value of the moved axis [deg or mm]."""
         return 0.0 if self.axis is None else self.axis.in_file_unit(self.value)
 
@@ -103,7 +103,10 @@ class PendantPose:
     def to_json(self) -> dict[str, object]:
         """Return the pose as plain values for JSON."""
         unit = "deg" if self.axis is None else self.axis.file_unit
-        moved: dict[str, object] = {"axis": self.axis and self.axis.name, f"value_{unit}": self.in_file_unit}
+        moved: dict[str, object] = {
+            "axis": self.axis and self.axis.name,
+            f"value_{unit}": self.axis_value_in_file_unit,
+        }
         return moved | self.tool_in_file_units | {"within_limits": self.is_within_limits}
 
 

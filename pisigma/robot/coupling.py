@@ -83,8 +83,8 @@ class Coupling:
         revolute: whether each joint is revolute.
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
-        driven: `(dof, axes)`: mask of the axes named in the file's entry of a coupled joint, possibly with the factor
-            0; all False for a joint without an entry.
+        is_factor_stated: `(dof, axes)`: mask of the axes named in the file's entry of a coupled joint, possibly
+            with the factor 0; all False for a joint without an entry.
         four_bars: index and linkage of every joint that is driven by a linkage.
         stops: index and mechanical limits [rad or m] of every joint that has limits in addition to those of the axes.
     """
@@ -93,7 +93,7 @@ class Coupling:
     revolute: tuple[bool, ...]
     matrix: Float64[np.ndarray, "dof axes"]
     offset: Float64[np.ndarray, " dof"]
-    driven: Bool[np.ndarray, "dof axes"]
+    is_factor_stated: Bool[np.ndarray, "dof axes"]
     four_bars: tuple[tuple[int, FourBar], ...] = ()
     stops: tuple[tuple[int, tuple[float, float]], ...] = ()
 

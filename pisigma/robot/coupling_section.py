@@ -99,7 +99,9 @@ def rows_and_coupling(
         revolute=tuple(joint.type == "revolute" for joint in joints),
         matrix=np.array([[_factor(section, joint, axis) for axis in axes] for joint, section in pairs]),
         offset=np.array([_offset(joint, section) for joint, section in pairs]),
-        driven=np.array([[s.joint in by_name and axis.name in s.factors for axis in axes] for s in stated]),
+        is_factor_stated=np.array(
+            [[s.joint in by_name and axis.name in s.factors for axis in axes] for s in stated]
+        ),
         four_bars=tuple((i, s.four_bar.to_si()) for i, s in enumerate(stated) if s.four_bar is not None),
         stops=tuple(
             (index, (joint.from_file_unit(limits[0]), joint.from_file_unit(limits[1])))
@@ -162,11 +164,13 @@ def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[st
         stated = {
             axis.name: factor
             * (joint.in_file_unit(1.0) / axis.in_file_unit(1.0) if axis.type != joint.type else 1.0)
-            for axis, factor, named in zip(coupling.axes, factors, coupling.driven[index], strict=True)
+            for axis, factor, named in zip(
+                coupling.axes, factors, coupling.is_factor_stated[index], strict=True
+            )
             if factor or named
         }
         offset = float(coupling.offset[index])
-        if not coupling.driven[index].any():
+        if not coupling.is_factor_stated[index].any():
             continue
         entry: dict[str, object] = {"joint": joint.name, "factors": stated}
         entry |= {f"offset_{joint.file_unit}": joint.in_file_unit(offset)} if offset else {}

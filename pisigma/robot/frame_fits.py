@@ -70,7 +70,7 @@ class MeasuredPoses:
         return replace(self, position=self.position[index], rotation=self.rotation[index])
 
     @property
-    def values(self) -> int:
+    def value_count(self) -> int:
         """Number of independent measured values: three per position and three per rotation."""
         return 3 * len(self.position) + 3 * int(self.has_rotation.sum())
 

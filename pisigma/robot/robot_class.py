@@ -76,7 +76,7 @@ class RobotClass:
         gravity_sigma: prior standard deviation of the weights of `GravityTorques` [rad].
         series_sigmas: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
         harmonics: number of harmonics of the series.
-        max_sizes: standard deviations of geometric errors that no robot of the class exceeds.
+        max_error_sigmas: standard deviations of geometric errors that no robot of the class exceeds.
         max_changes: largest changes due to wear or a collision.
         max_calibrated_error_per_reach: largest error after a calibration of a robot of the class, as a share of its
             reach.
@@ -89,7 +89,7 @@ class RobotClass:
     gravity_sigma: float
     series_sigmas: tuple[float, ...]
     harmonics: int
-    max_sizes: GeometricErrorSizes
+    max_error_sigmas: GeometricErrorSizes
     max_changes: ChangeLimits
     max_calibrated_error_per_reach: float
     joint_repeatability: float = 0.0
@@ -107,7 +107,7 @@ class RobotClass:
 
     def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
         """Return whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
-        return all(size <= self.max_sizes.size_of(group) for group, size in sizes)
+        return all(size <= self.max_error_sigmas.size_of(group) for group, size in sizes)
 
 
 INDUSTRIAL: Final = RobotClass(
@@ -118,7 +118,9 @@ INDUSTRIAL: Final = RobotClass(
     gravity_sigma=2.7e-4,
     series_sigmas=(2.4e-4, 2.4e-4, 4e-6, 4e-6, 1.5e-4, 2e-6, 2e-6),
     harmonics=15,
-    max_sizes=GeometricErrorSizes(joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3),
+    max_error_sigmas=GeometricErrorSizes(
+        joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3
+    ),
     max_changes=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
     max_calibrated_error_per_reach=2.5e-3,
 )
@@ -133,7 +135,7 @@ factor it is 0.74, 0.93 and 1.1. The largest sizes are twice those of the worst 
 COBOT: Final = replace(
     INDUSTRIAL,
     name="cobot",
-    max_sizes=replace(INDUSTRIAL.max_sizes, joint_offset=20e-3),
+    max_error_sigmas=replace(INDUSTRIAL.max_error_sigmas, joint_offset=20e-3),
     max_changes=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
 )
 """Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors are
@@ -156,7 +158,9 @@ HOBBY: Final = replace(
     COBOT,
     name="hobby",
     prior_sizes=GeometricErrorSizes(joint_offset=30e-3, length=1e-3, zero_length=1e-3, axis_angle=5e-3),
-    max_sizes=GeometricErrorSizes(joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3),
+    max_error_sigmas=GeometricErrorSizes(
+        joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3
+    ),
     max_changes=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
     max_calibrated_error_per_reach=7.5e-3,
 )
@@ -167,7 +171,7 @@ SERVO: Final = replace(
     HOBBY,
     name="servo",
     prior_sizes=replace(HOBBY.prior_sizes, joint_offset=0.1),
-    max_sizes=replace(HOBBY.max_sizes, joint_offset=0.3),
+    max_error_sigmas=replace(HOBBY.max_error_sigmas, joint_offset=0.3),
     max_calibrated_error_per_reach=0.04,
     joint_repeatability=math.radians(0.5),
 )

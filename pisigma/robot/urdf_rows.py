@@ -41,11 +41,11 @@ class ChainRows:
 
     Attributes:
         fields: rows, base, tool and names.
-        frames: for every joint, the frame of its row in the joint's frame; both share the axis and move together.
+        T_joint_row: for every joint, the frame of its row in the joint's frame; both share the axis and move together.
     """
 
     fields: RobotFields
-    frames: tuple[Frame, ...]
+    T_joint_row: tuple[Frame, ...]
 
 
 URDF_SOURCE = "URDF file "

@@ -288,4 +288,4 @@ def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " 
     per_axis = torch.bincount(jig.axis, minlength=3)
     weight = 1.0 / per_axis[jig.axis].to(u.dtype)
     bounds = weight.cumsum(0) / weight.sum()
-    return torch.searchsorted(bounds, u.contiguous(), right=True).clamp(max=jig.faces - 1)
+    return torch.searchsorted(bounds, u.contiguous(), right=True).clamp(max=jig.face_count - 1)

@@ -290,7 +290,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
     options: dict[str, Any] = dict(files)
     options |= {key: form[key].strip() for key in _EXPORT_OPTIONS if form.get(key, "").strip()}
     exported = export_from_cell(cell, name, ExportRequest(cell.folder, out, **options))
-    written = f"{exported.summary or kind.title} written to {out.name}{exported.details}."
+    written = f"{exported.sentence_start or kind.title} written to {out.name}{exported.sentence_end}."
     verdict = Verdict(written, "", "test every program at low speed.", "File")
     left: Any = exported.facts.get("left_alone", [])
     alone, changed = (

@@ -90,9 +90,9 @@ class ComparedModels:
             "robot": first.robot.name,
             "frames": self.settings.frames,
             "level": differences.significance_level,
-            "differs": [one.to_json() for one in differences.differing],
+            "differs": [one.to_json() for one in differences.significant_differences],
             "parameters": [_parameter_json(one) for one in differences.parameters],
-            "frames_moved": [one.to_json() for one in differences.frames],
+            "frames_moved": [one.to_json() for one in differences.frame_movements],
             "remainder": None if differences.remainder is None else vars(differences.remainder),
             "workspace": self.workspace_displacement.to_json(first.robot),
             "rows": None if rows is None else {**rows.to_json(), "better": self.better_model},
@@ -220,7 +220,7 @@ def compare(
         models=models,
         settings=settings,
         parameters=parameter_differences(pair, settings.level),
-        workspace_displacement=Displacement.from_pair(pair, pair.workspace, "the workspace"),
+        workspace_displacement=Displacement.from_pair(pair, pair.workspace_joints, "the workspace"),
         row_comparison=compared,
         program_displacement=None
         if program is None
@@ -240,8 +240,8 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
         )
     level = f"at a significance level of {differences.significance_level:.2g} for all parameters together"
     lines = [f"No parameter of {second} differs from {first} beyond its uncertainty, {level}."]
-    if differences.differing:
-        shifts = "; ".join(one.sentence for one in differences.differing)
+    if differences.significant_differences:
+        shifts = "; ".join(one.sentence for one in differences.significant_differences)
         lines = [
             f"{second} differs from {first} in {shifts}. No other parameter differs beyond its uncertainty, {level}."
         ]
@@ -249,8 +249,10 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
         lines.append(
             "The remaining differences are significant: the joint corrections or several parameters differ."
         )
-    pairs = zip(differences.frames[::2], differences.frames[1::2], strict=True)
-    clauses = [f"in the {length.what} by {length.size} and {angle.size}" for length, angle in pairs]
+    pairs = zip(differences.frame_movements[::2], differences.frame_movements[1::2], strict=True)
+    clauses = [
+        f"in the {length.what} by {length.shift_text} and {angle.shift_text}" for length, angle in pairs
+    ]
     return (*lines, *((f"{second} differs from {first} {' and '.join(clauses)}.",) if clauses else ()))
 
 

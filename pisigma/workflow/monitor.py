@@ -139,9 +139,11 @@ class MonitoringResult:
         paying = [one for one in self.sessions_of_call if one.session.recalibrate]
         if not paying:
             return None
-        known = sum(paying[-1].session.observable)
+        known = sum(paying[-1].session.zero_is_observable)
         later = [one for one in self.all_sessions if one.date > paying[-1].date]
-        outdated = any(not one.session.recalibrate and sum(one.session.observable) >= known for one in later)
+        outdated = any(
+            not one.session.recalibrate and sum(one.session.zero_is_observable) >= known for one in later
+        )
         return None if outdated else paying[-1]
 
     @property
@@ -165,8 +167,9 @@ class MonitoringResult:
             if self.cell is not None:  # the cell would not use a model folder that is not in its history
                 command = shlex.join(["pisigma", "recalibrate", os.fspath(self.cell)])
             advice = (
-                f"Recalibration is worthwhile: errors like those of {best.file} are expected to fall from "
-                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run `{command}`.",
+                f"Recalibration is worthwhile: errors like those of {best.file} are expected to fall "
+                f"from {best.session.rms * 1e3:.3f} to "
+                f"{best.session.rms_after_recalibration * 1e3:.3f} mm; run `{command}`.",
             )
         lines = (*(one.sentence for one in self.untrusted_sessions), *alarms, *moves, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)

@@ -152,7 +152,7 @@ def recalibrate(
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, every, elsewhere, right.wrong_row_indices)
     consistency = _fleet_consistency(parent, rows)
-    if consistency is not None and consistency.class_share > 0:
+    if consistency is not None and consistency.class_covariance_factor > 0:
         # The narrow prior may have rejected rows that are right for a robot unlike its fleet.
         wide = consistency.widened(posterior)
         rows, adaptation, outliers = _adapted(parent, wide, every, elsewhere, right.wrong_row_indices)
@@ -254,7 +254,7 @@ def _believable(choice: CandidateChoice, robot: Robot) -> bool:
     """Return whether the recalibrated model predicts held-out rows well enough for its changes to be credible."""
     error, kept = choice.rms["recalibrated"], choice.rms[choice.kept]
     if error is None or kept is None:
-        return not choice.rows
+        return not choice.held_out_row_count
     return error <= min(plausible_error_per_reach(robot) * robot.reach, CLEAR_RATIO * kept)
 
 
@@ -273,7 +273,7 @@ def _summary(
         rows=rows.rows,
         kept_candidate=choice.kept,
         verdict=choice.sentence,
-        held_out_row_count=choice.rows,
+        held_out_row_count=choice.held_out_row_count,
         cross_validation={
             name: HeldOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in choice.rms.items()
@@ -315,10 +315,10 @@ def _moved_frames(
 def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurements) -> tuple[str, ...]:
     """Return warnings, one sentence each."""
     warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
-    if choice.rows < _MIN_ROWS:
+    if choice.held_out_row_count < _MIN_ROWS:
         warnings.append(
-            f"Only {choice.rows} of {rows.rows} rows could be held out and predicted, too few to compare the "
-            f"candidates; measure {2 * _MIN_ROWS} poses or more."
+            f"Only {choice.held_out_row_count} of {rows.rows} rows could be held out and predicted, too few to compare "
+            f"the candidates; measure {2 * _MIN_ROWS} poses or more."
         )
     return tuple(warnings)
 

@@ -139,7 +139,7 @@ def monitoring_text(monitoring: MonitoringResult, closing_sentences: Sequence[st
     """
     sessions, name = monitoring.sessions_of_call, monitoring.model.name
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
-    unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
+    unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable_sentences)
     charts = table_block(
         f"charts of {len(monitoring.all_sessions)} sessions", *chart_table(monitoring.charts)
     )

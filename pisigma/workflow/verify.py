@@ -249,7 +249,7 @@ def _motion(
         return None
     motion = find_motion(model, rows, fitted)
     nominal = comparison.models[0].position.statistics["rms"] * 1e-3
-    return motion if motion is not None and motion.rms_after < nominal else None
+    return motion if motion is not None and motion.rms_after_recalibration < nominal else None
 
 
 def _verdict(

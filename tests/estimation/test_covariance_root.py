@@ -24,7 +24,7 @@ def test_the_covariance_after_few_values_is_the_inverse_of_the_information() -> 
     assert few is not None
     root = few.left_multiply(torch.eye(WEIGHTS, dtype=torch.float64))
     precision = few.Z.t() @ few.Z + torch.eye(WEIGHTS, dtype=torch.float64)
-    expected = few.size[:, None] * torch.linalg.inv(precision) * few.size
+    expected = few.prior_sigma[:, None] * torch.linalg.inv(precision) * few.prior_sigma
     assert_close(root @ root.t(), expected, rtol=1e-12)
 
 

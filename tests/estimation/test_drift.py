@@ -40,14 +40,14 @@ def dense_evidence(looked_at: DriftSearch, sizes: list[float]) -> float:
     values = looked_at.values
     V = looked_at._K + NOISE**2 * torch.eye(50).double()
     for group, size in zip(looked_at._groups, sizes, strict=True):
-        Z = values.X[:, group.index] * group.scale
+        Z = values.X[:, group.index] * group.sigma_at_unit_size
         V = V + size**2 * Z @ Z.t()
     return -0.5 * float(values.y @ torch.linalg.solve(V, values.y) + torch.logdet(V))
 
 
 def test_only_what_moved_has_a_size():
     drift = estimated(search(MOVED))
-    sizes = {group.name: group.size for group in drift.groups}
+    sizes = {group.name: group.drift_size for group in drift.groups}
     assert [what for what, size in sizes.items() if size] == ["joint 2"]
     assert_close(math.log10(sizes["joint 2"]), math.log10(MOVED), atol=0.3)
     assert_close(drift.noise[0], NOISE, rtol=0.3)
@@ -55,13 +55,13 @@ def test_only_what_moved_has_a_size():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_nothing_has_a_size_if_nothing_moved(seed):
-    assert not any(group.size for group in estimated(search(0.0, seed)).groups)
+    assert not any(group.drift_size for group in estimated(search(0.0, seed)).groups)
 
 
 def test_a_size_has_the_highest_evidence():
     looked_at = search(MOVED, stated=True)
     drift = estimated(looked_at)
-    sizes = [group.size for group in drift.groups]
+    sizes = [group.drift_size for group in drift.groups]
     best = dense_evidence(looked_at, sizes)
     number = sizes.index(max(sizes))
     for size in (0.0, *SIZES[::5].tolist()):
@@ -71,7 +71,7 @@ def test_a_size_has_the_highest_evidence():
 
 def test_a_shift_is_that_of_least_squares():
     looked_at = search(MOVED, stated=True)
-    number = [group.size > 0 for group in estimated(looked_at).groups].index(True)
+    number = [group.drift_size > 0 for group in estimated(looked_at).groups].index(True)
     shift, covariance = looked_at.estimate_shift(number, with_prior=False)
     x = looked_at.values.X[:, 4]
     V = looked_at._K + NOISE**2 * torch.eye(50).double()

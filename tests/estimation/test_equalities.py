@@ -22,7 +22,7 @@ def test_solution_and_covariance_are_those_of_weighted_least_squares():
     assert_close(torch.cat([found.z, found.x]), solution, atol=1e-10)
     assert_close(root @ root.mT, covariance, atol=1e-10)
     assert_close(found.misfit, float((y - X @ solution).square().sum()), rtol=1e-9)
-    assert found.redundancy == 5
+    assert found.degrees_of_freedom == 5
 
 
 def test_equations_between_exact_values_hold():

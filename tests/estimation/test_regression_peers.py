@@ -49,14 +49,14 @@ def test_sizes_and_noise_by_the_evidence_are_those_of_bayesian_ridge(form: str):
     posterior = both_forms(X, y, prior)[form].maximise_evidence(prior, (0.5,), 500, 1e-13)
     assert_close(posterior.x, torch.from_numpy(peer.coef_), rtol=1e-6)
     assert posterior.noise[0] == pytest.approx(peer.alpha_**-0.5, rel=1e-6)
-    assert float(posterior.prior.sizes[1]) == pytest.approx(peer.lambda_**-0.5, rel=1e-5)
+    assert float(posterior.prior.group_scales[1]) == pytest.approx(peer.lambda_**-0.5, rel=1e-5)
 
 
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_the_covariance_is_that_of_bayesian_ridge(form: str):
     X, y, prior = random_case()
     peer = BayesianRidge(max_iter=2000, tol=1e-13, fit_intercept=False).fit(X.numpy(), y.numpy())
-    prior = replace(prior, sizes=torch.tensor([1.0, peer.lambda_**-0.5]).double())
+    prior = replace(prior, group_scales=torch.tensor([1.0, peer.lambda_**-0.5]).double())
     regression = both_forms(X, y, prior)[form]
     root = regression.covariance_root(regression.solve(prior, (float(peer.alpha_) ** -0.5,))).as_matrix
     assert_close(root @ root.t(), torch.from_numpy(peer.sigma_), rtol=1e-9)
@@ -65,7 +65,7 @@ def test_the_covariance_is_that_of_bayesian_ridge(form: str):
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_the_evidence_is_that_of_a_gaussian_process(form: str):
     X, y, prior = random_case(values=12)
-    size, noise = float(prior.sizes[1]), 0.4
+    size, noise = float(prior.group_scales[1]), 0.4
     kernel = ConstantKernel(size**2, "fixed") * DotProduct(0.0, "fixed")
     peer = GaussianProcessRegressor(kernel, alpha=noise**2, optimizer=None).fit(X.numpy(), y.numpy())
     posterior = both_forms(X, y, prior)[form].solve(prior, (noise,))
@@ -79,7 +79,7 @@ def test_parameters_without_prior_are_exact_in_fifty_digits(form: str, scale: fl
     """Weights of a millionth of the parameters' size, like gear errors compared with lengths."""
     X, y, prior = random_case(values=14, parameters=3)
     X[:, 3:] *= scale
-    prior = replace(prior, sizes=prior.sizes * torch.tensor([1.0, 1 / scale]).double())
+    prior = replace(prior, group_scales=prior.group_scales * torch.tensor([1.0, 1 / scale]).double())
     noise = 0.3
     regression = both_forms(X, y, prior)[form]
     posterior = regression.solve(prior, (noise,))

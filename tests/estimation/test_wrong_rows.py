@@ -41,7 +41,7 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
 def test_a_wrong_configuration_is_found_despite_a_drift(off):
     result = explained(off)
     assert list(result.values.wrong_configurations) == [5]
-    assert [group.name for group in result.explanation.drift.groups if group.size] == ["joint 1"]
+    assert [group.name for group in result.explanation.drift.groups if group.drift_size] == ["joint 1"]
     assert_close(result.explanation.estimate_shift(0)[0], torch.tensor([MOVED]), rtol=0.05)
     expected = result.explanation.drift.noise * torch.ones(36).double()
     assert_close(result.sigma[:15], expected[:15])

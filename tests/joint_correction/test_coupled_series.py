@@ -57,7 +57,7 @@ def test_columns_are_of_the_order_of_one_in_every_batch(text):
     robot = coupled_robot(text)
     feature, q = CoupledSeries(robot), drawn(robot, 6)
     columns = feature.columns(JointState(q))
-    assert columns.shape == (6, robot.dof, feature.count)
+    assert columns.shape == (6, robot.dof, feature.column_count)
     assert 0.05 < float((columns * feature.used).abs().max()) < 5
     assert_close(
         feature.columns(JointState(q.reshape(3, 1, 2, -1))).reshape(columns.shape), columns, atol=1e-15

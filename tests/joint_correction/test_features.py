@@ -110,7 +110,7 @@ def test_the_period_of_an_unlimited_prismatic_joint_is_twice_the_reach():
 @pytest.mark.parametrize("harmonics", [1, 2, 5, 30])
 def test_harmonics_share_prior_scales_in_bands(harmonics, fine, starts):
     series = FourierSeries(Robot.load("rb5"), harmonics, fine)
-    assert series.count == 2 * harmonics
+    assert series.column_count == 2 * harmonics
     assert bool(series.used.all())
     assert len(series.group_names) == int(series.group.max()) + 1
     bands = series.group[0, :harmonics]
@@ -231,12 +231,12 @@ def test_batches_and_types(batch, dtype):
     q = joints(robot, *batch).to(dtype)
     for features in every_kind(robot):
         columns = features.columns(JointState(q))
-        assert columns.shape == (*batch, 4, features.count)
+        assert columns.shape == (*batch, 4, features.column_count)
         assert columns.dtype == dtype
         flat = q.reshape(-1, 4)
         looped = [features.columns(JointState(one)) for one in flat]
         if looped:
-            assert_close(columns.reshape(-1, 4, features.count), torch.stack(looped), atol=1e-5)
+            assert_close(columns.reshape(-1, 4, features.column_count), torch.stack(looped), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", [None, *ROBOTS])

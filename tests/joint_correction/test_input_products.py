@@ -49,7 +49,7 @@ def test_columns_are_products_of_inputs_of_different_joints(name: str) -> None:
 def test_every_joint_has_its_own_prior_size() -> None:
     products = InputProducts(Robot.load("kiro3"))
     assert bool(products.used.all())
-    assert products.group.tolist() == [[joint] * products.count for joint in range(4)]
+    assert products.group.tolist() == [[joint] * products.column_count for joint in range(4)]
     names = [row.name for row in products.robot.joints]
     assert products.group_names == tuple(f"products, {name}" for name in names)
     assert products.label == "products"
@@ -71,7 +71,7 @@ def test_product_units_are_equal_to_the_weighted_sum_of_the_columns(name: str, s
     weights = 1e-4 * normal(products.used.numel(), seed=seed)
     made = network_of(products, weights)
     assert len(made.orders) < products.inputs
-    assert_close(made(q), weighted(products, weights, q), atol=1e-16 * products.count)
+    assert_close(made(q), weighted(products, weights, q), atol=1e-16 * products.column_count)
 
 
 def test_one_unit_is_enough_for_one_product_of_two_sums() -> None:
@@ -93,7 +93,7 @@ def test_one_unit_is_enough_for_one_product_of_two_sums() -> None:
 def test_joints_may_have_different_weights_and_none() -> None:
     robot = Robot.load("rb5")
     products, q = InputProducts(robot), random_joints(robot, 10, 3)
-    weights = normal(robot.dof, products.count)
+    weights = normal(robot.dof, products.column_count)
     weights[[0, 3]] = 0.0
     made = network_of(products, weights.flatten())
     found = made(q)

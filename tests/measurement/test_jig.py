@@ -70,7 +70,7 @@ def test_lines_intersect_blocks(tmp_path: Path):
 def test_the_jig_that_comes_with_the_package_steps_down_along_x_and_y():
     jig = Jig.load("stepped")
     assert sorted(set(jig.axis.tolist())) == [0, 1, 2]
-    assert jig.faces == 15
+    assert jig.face_count == 15
     assert sorted(jig.coordinate[jig.axis == 2].tolist()) == pytest.approx([0.12, 0.24, 0.36])
     assert "not published" in jig.source
     middles = torch.stack(jig.extent).mean(0)

@@ -58,9 +58,9 @@ def test_fitted_tool_is_uncertain_by_what_the_fit_depends_on(name):
     assert_close(found.fit.estimates, TOOL[:3], atol=1e-6)
     assert found.model.hybrid is not None
     if name == "base_wall_x":
-        assert_close(np.array(found.arm_variance), np.zeros(3))
+        assert_close(np.array(found.variance_due_to_arm), np.zeros(3))
     elif name == "weights":
-        assert max(found.arm_variance) > 0
+        assert max(found.variance_due_to_arm) > 0
     else:
         bases = {one: base.copy() for one, base in model.hybrid_bases.items()}
         robot = model.hybrid.robot
@@ -72,7 +72,7 @@ def test_fitted_tool_is_uncertain_by_what_the_fit_depends_on(name):
             bases["floor"][0] += 1e-3
         moved = fit_frames(robot, replace(rows, q=corrected_joints(model.hybrid, rows)), "tool", bases)
         change = moved.estimates - found.fit.estimates
-        assert_close(np.sqrt(found.arm_variance), np.abs(change), rtol=0.02, atol=1e-6)
+        assert_close(np.sqrt(found.variance_due_to_arm), np.abs(change), rtol=0.02, atol=1e-6)
 
 
 def test_weights_count_for_the_causes_of_a_misfit():
@@ -81,7 +81,9 @@ def test_weights_count_for_the_causes_of_a_misfit():
     assert known is not None
     assert model.hybrid is not None
     fit = fit_frames(model.hybrid.robot, rows, "tool", model.hybrid_bases)
-    assert bool(ArmUncertainty(known, rows).spread(fit.solved, fit.used_rows, fit.frame_indices).any())
+    assert bool(
+        ArmUncertainty(known, rows).value_covariance_root(fit.solved, fit.used_rows, fit.frame_indices).any()
+    )
 
 
 def test_direction_that_is_held_is_uncertain_in_the_model():

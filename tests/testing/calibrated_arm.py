@@ -38,7 +38,7 @@ def random_correction(
     with torch.no_grad():
         for weight, chosen in zip(correction.linear, features, strict=True):
             drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
-            weight.copy_(size * 5e-4 / math.sqrt(chosen.count) * drawn * chosen.used)
+            weight.copy_(size * 5e-4 / math.sqrt(chosen.column_count) * drawn * chosen.used)
         for weight in (correction.weight, correction.bias):
             weight.copy_(0.02 * size * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
     return correction.requires_grad_(False)

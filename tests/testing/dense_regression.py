@@ -38,7 +38,7 @@ class DenseRegression(AbstractDesignRegression):
         parts = []
         for number, values in enumerate(rows.values):
             root = values.weight_root[:, None]
-            group = torch.full_like(values.row, -1) if values.is_stated else rows.group[values.row]
+            group = torch.full_like(values.row, -1) if values.are_values_given else rows.group[values.row]
             parts.append(
                 (
                     (design.columns(values, slice(None)) * root[..., None]).flatten(0, 1),

@@ -56,7 +56,7 @@ def hybrid_model(
     with torch.no_grad():
         for chosen, weight in zip(correction.features, correction.linear, strict=True):
             drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
-            weight.copy_(size / chosen.count**0.5 * drawn * chosen.used)
+            weight.copy_(size / chosen.column_count**0.5 * drawn * chosen.used)
         for part in (correction.weight, correction.bias):
             part.copy_(size**0.5 * torch.randn(part.shape, generator=generator, dtype=torch.float64))
     correction.requires_grad_(False)

@@ -33,7 +33,7 @@ def assert_same_posterior(
         noise: noise per sensor; the second one is larger.
         exactness: tolerance of the unknowns in standard deviations.
     """
-    narrow = replace(prior, sizes=prior.sizes / 3)
+    narrow = replace(prior, group_scales=prior.group_scales / 3)
     ways = ((prior, noise), (narrow, tuple(2 * sigma for sigma in noise)))
     evidence = []
     for own, sigma in ways:

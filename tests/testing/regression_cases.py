@@ -69,9 +69,14 @@ def case_of(
     """Return a case with different prior scales of the groups."""
     design = Design(arm.rows.problem, features)
     prior = design.prior(arm.prior_scale)
-    factor = torch.linspace(0.5, 3.0, len(prior.sizes), dtype=torch.float64)
+    factor = torch.linspace(0.5, 3.0, len(prior.group_scales), dtype=torch.float64)
     return RegressionCase(
-        design, smaller, arm.rows, replace(prior, sizes=prior.sizes * factor), arm.noise, exactness
+        design,
+        smaller,
+        arm.rows,
+        replace(prior, group_scales=prior.group_scales * factor),
+        arm.noise,
+        exactness,
     )
 
 

@@ -53,7 +53,7 @@ def test_models_of_the_same_name_and_rows_get_different_names_and_a_warning():
     model = model_of(50)
     result = compare(model, replace(model))
     assert list(result.models) == ["rows_50", "rows_50-2"]
-    assert result.parameters.differing == ()
+    assert result.parameters.significant_differences == ()
     assert_close(result.to_json()["workspace"]["max_mm"], 0.0, atol=1e-6)
     assert len(result.warnings) == 1
 

@@ -27,7 +27,7 @@ def test_the_next_call_is_answered_by_the_new_model(cell, repository):
     assert ik(T, near=near).model == ik.path(T[None], near=near).solution.model == FIRST
     assert isinstance(ik, pisigma.CorrectedIK)
     put_into_use(cell, SECOND)
-    ik._in_use.check()
+    ik._in_use.load_if_changed()
     near = np.full(len(ik.joints), 0.3)
     T = ik.forward(near)
     solution, alone = ik(T, near=near), pisigma.load(repository / "models" / SECOND)(T, near=near)
@@ -42,7 +42,7 @@ def test_a_path_that_was_begun_is_answered_by_one_model(cell, monkeypatch):
     T = ik.forward(near)[None]
     path = ik.path
     put_into_use(cell, SECOND)
-    ik._in_use.check()
+    ik._in_use.load_if_changed()
     assert path(T, near=near).solution.model == FIRST
     assert ik.name == SECOND
 
@@ -52,7 +52,7 @@ def test_a_damaged_model_is_named_in_warnings_of_the_previous_model(cell):
     path = cell.folder / "models" / SECOND / "model.yaml"
     path.write_text("damaged")
     put_into_use(cell, SECOND)
-    ik._in_use.check()
+    ik._in_use.load_if_changed()
     assert ik.name == FIRST
     assert any(SECOND in warning for warning in ik.warnings)
 

@@ -61,13 +61,13 @@ class Disagreement:
     Attributes:
         shared: the object.
         distance: largest distance between its positions according to two arms, with the fitted bases [m].
-        probability: probability that arms without faults differ at least as much at this object, given the other
+        p_value: probability that arms without faults differ at least as much at this object, given the other
             objects.
     """
 
     shared: SharedObject
     distance: float
-    probability: float
+    p_value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class ArmBases:
     """Bases of several arms, relative to the base of the first arm.
 
     Attributes:
-        arms: posteriors of the individually calibrated arms.
+        individual_posteriors: posteriors of the individually calibrated arms.
         shared: what the arms have in common.
         T_first_base: pose of every arm's base in the base of the first arm.
         tips: positions of touching tips that no target of the rows is, on the last row of an arm [m].
@@ -83,25 +83,27 @@ class ArmBases:
             the axes of the first arm's base [m and rad], followed by `tips`; its z the directions of the roots of all
             arms.
         object_of_equation: per equation, the index of the shared object.
-        max_distances: per shared object, the largest distance between its positions by two arms [m].
+        largest_distances: per shared object, the largest distance between its positions by two arms [m].
         equation_system: derivatives of the equations with respect to z and x, their misclosure at z = 0, and their
             standard deviations.
     """
 
-    arms: tuple[ArmPosterior, ...]
+    individual_posteriors: tuple[ArmPosterior, ...]
     shared: tuple[SharedObject, ...]
     T_first_base: Float64[Tensor, "arms 4 4"]
     tips: dict[Tip, Float64[Tensor, " 3"]]
     conditioned: ConditionedUnknowns
     object_of_equation: tuple[int, ...]
-    max_distances: tuple[float, ...]
+    largest_distances: tuple[float, ...]
     equation_system: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def covariance_root(self) -> Float64[Tensor, "arms 6 directions"]:
         """Root of the covariance of the bases, as shifts along and rotations about the axes of the first base."""
-        found = self.conditioned.x_root[: 6 * (len(self.arms) - 1)]
-        return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(len(self.arms), 6, -1)
+        found = self.conditioned.x_root[: 6 * (len(self.individual_posteriors) - 1)]
+        return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(
+            len(self.individual_posteriors), 6, -1
+        )
 
     def relative(self, first: int, second: int) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "6 6"]]:
         """Return the base of an arm relative to that of another arm, with its covariance.
@@ -127,7 +129,7 @@ class ArmBases:
         turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
         return T, turned @ turned.mT
 
-    def tool_to_tool_deviation(self, first: int, second: int, postures: tuple[Postures, ...]) -> float:
+    def tool_to_tool_sigma(self, first: int, second: int, postures: tuple[Postures, ...]) -> float:
         """Return the RMS standard deviation of the vector from the tool of one arm to that of another [m].
 
         Unlike the uncertainty of the bases, it does not depend on errors that a base absorbs, such as the zero of
@@ -150,9 +152,9 @@ class ArmBases:
 
     def _tool_root(self, number: int, postures: Postures) -> Float64[Tensor, "postures 3 directions"]:
         """Return a root of the covariance of the positions of a tool in the base of the first arm."""
-        arm = self.arms[number]
-        sizes = [one.covariance_root.shape[1] for one in self.arms]
-        T, columns = arm.positions_in_base(postures)
+        arm = self.individual_posteriors[number]
+        sizes = [one.covariance_root.shape[1] for one in self.individual_posteriors]
+        T, columns = arm.tool_poses_in_base(postures)
         in_base = columns @ (arm.covariance_root @ torch.split(self.conditioned.z_root, sizes)[number])
         R = self.T_first_base[number, :3, :3]
         away = (R @ T[:, :3, 3, None])[..., 0]
@@ -161,27 +163,30 @@ class ArmBases:
 
     def joints_in_common(self, first: int, second: int) -> int:
         """Return the number of joints of a torso that two arms share."""
-        return shared_joint_count(self.arms[first], self.arms[second])
+        return shared_joint_count(self.individual_posteriors[first], self.individual_posteriors[second])
 
     def reference_arm(self, arm_index: int) -> int:
         """Return the index of the arm whose base and shared joints an arm has."""
-        while (before := arms_sharing_most_joints(self.arms)[arm_index][0]) != arm_index:
+        while (before := arms_sharing_most_joints(self.individual_posteriors)[arm_index][0]) != arm_index:
             arm_index = before
         return arm_index
 
     @cached_property
     def updated_arms(self) -> tuple[ArmPosterior, ...]:
         """Posteriors of the arms given all equations; arms of a torso share the base and the rows of common joints."""
-        sizes = [arm.covariance_root.shape[1] for arm in self.arms]
+        sizes = [arm.covariance_root.shape[1] for arm in self.individual_posteriors]
         parts = zip(
             torch.split(self.conditioned.z, sizes),
             torch.split(self.conditioned.z_root, sizes),
-            arms_sharing_most_joints(self.arms),
+            arms_sharing_most_joints(self.individual_posteriors),
             strict=True,
         )
         arms: list[ArmPosterior] = []
         for number, (z, z_root, (before, count)) in enumerate(parts):
-            arm, own = self.arms[number], len(self.arms[number].space.parameters)
+            arm, own = (
+                self.individual_posteriors[number],
+                len(self.individual_posteriors[number].space.parameters),
+            )
             arm = with_values(arm, arm.values + arm.covariance_root[:own] @ z, arm.covariance_root @ z_root)
             if count:
                 root = self.reference_arm(number)
@@ -193,15 +198,15 @@ class ArmBases:
         return tuple(arms)
 
     @property
-    def probability(self) -> float:
+    def p_value(self) -> float:
         """Probability of a larger misfit between arms without faults; 1 if no object is measured twice."""
         found = self.conditioned
-        return float(chi2.sf(found.misfit, found.redundancy)) if found.redundancy else 1.0
+        return float(chi2.sf(found.misfit, found.degrees_of_freedom)) if found.degrees_of_freedom else 1.0
 
     @cached_property
     def disagreements(self) -> tuple[Disagreement, ...]:
         """Shared objects on whose location the arms disagree, least probable first; empty if they agree."""
-        if self.probability >= _FALSE_ALARMS:
+        if self.p_value >= _FALSE_ALARMS:
             return ()
         found = []
         B, G, r, closure = self.equation_system
@@ -209,15 +214,15 @@ class ArmBases:
         for index, shared in enumerate(self.shared):
             others = number != index
             if int(torch.linalg.matrix_rank(G[others], rtol=COLLINEAR)) < G.shape[1]:
-                drop, freedom = self.conditioned.misfit, self.conditioned.redundancy
+                drop, freedom = self.conditioned.misfit, self.conditioned.degrees_of_freedom
             else:
                 left = condition_on_equalities(B[others], G[others], r[others], closure[others])
                 drop = self.conditioned.misfit - left.misfit
-                freedom = self.conditioned.redundancy - left.redundancy
+                freedom = self.conditioned.degrees_of_freedom - left.degrees_of_freedom
             probability = float(chi2.sf(drop, freedom))
             if probability < _FALSE_ALARMS / len(self.shared):
-                found.append(Disagreement(shared, self.max_distances[index], probability))
-        return tuple(sorted(found, key=lambda one: (one.probability, -one.distance)))
+                found.append(Disagreement(shared, self.largest_distances[index], probability))
+        return tuple(sorted(found, key=lambda one: (one.p_value, -one.distance)))
 
 
 def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
@@ -308,7 +313,7 @@ def _used(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[
     for one in shared:
         for number in one.arms:
             frame, rows = arms[number].shared_objects[one.key]
-            used[number] |= {*rows, *(() if one.kind == JOINT else arms[number].base_rows(frame))}
+            used[number] |= {*rows, *(() if one.kind == JOINT else arms[number].base_indices(frame))}
     return [sorted(rows) for rows in used]
 
 

@@ -27,7 +27,7 @@ class ArmUncertainty:
     uncertainty: PositionUncertainty
     rows: Measurements
 
-    def spread(
+    def value_covariance_root(
         self, solved: SolvedCalibration, used_rows: Collection[int], fitted_parameters: Collection[int]
     ) -> Float64[Tensor, "values directions"]:
         """Return a root of the covariance of the measured values, in standard deviations of their noise.

@@ -98,12 +98,12 @@ class FrameFit:
 
     @cached_property
     def values(self) -> WhitenedValues:
-        """Measured values at the solution, linear in the fitted directions (see `basis`)."""
+        """Measured values at the solution, linear in the `fitted_directions`."""
         values = WhitenedValues.at_solution(self.solved, self.solved.problem.active.tolist())
-        return replace(values, X=values.X @ self.basis)
+        return replace(values, X=values.X @ self.fitted_directions)
 
     @cached_property
-    def basis(self) -> Float64[Tensor, "active fitted"]:
+    def fitted_directions(self) -> Float64[Tensor, "active fitted"]:
         """Fitted directions, in the coordinates of the problem: all except those that were held."""
         problem = self.solved.problem
         if problem.held_directions is None:

@@ -26,7 +26,7 @@ def shared_object_in_base(
     frame, rows = arm.shared_objects[key]
     if key[0] == JOINT:
         return frame_after_rows(values_at(rows)), values_at(())
-    T_base_frame = invert(transform_from_xyz_zyx(values_at(arm.base_rows(frame))))
+    T_base_frame = invert(transform_from_xyz_zyx(values_at(arm.base_indices(frame))))
     if key[0] == "frame":
         return T_base_frame, values_at(())
     point = transform(torch.eye(3, dtype=torch.float64), values_at(rows[:3]))

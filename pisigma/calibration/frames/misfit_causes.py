@@ -92,7 +92,9 @@ def _residuals(
             causes[kind] = X_unknowns[:, chosen] * torch.tensor(sizes, dtype=torch.float64)
     known = X_unknowns * _stated_deviations(solved, rows)
     if uncertainty is not None:
-        known = torch.cat([known, uncertainty.spread(solved, fit.used_rows, {*frames, *unknowns})], 1)
+        known = torch.cat(
+            [known, uncertainty.value_covariance_root(solved, fit.used_rows, {*frames, *unknowns})], 1
+        )
     return FitResiduals.from_fit(
         y=unit * (values.y + X_unknowns @ moved),
         fitted_columns=unit[:, None] * X_frames,
@@ -136,7 +138,7 @@ def _stated_deviations(solved: SolvedCalibration, rows: Measurements) -> Float64
     space, unknowns = solved.problem.space, solved.setup.free_unknowns
     images = ImageIntrinsics.from_csv_cells(texts_of(rows, INTRINSICS_COLUMN))
     stated = {
-        ("camera", name): images.sigma[(cameras(rows) or ()).index(name)].tolist()
+        ("camera", name): images.prior_sigma[(cameras(rows) or ()).index(name)].tolist()
         for name in distinct_names(cameras(rows))
     }
     for name in distinct_names(boards(rows)):

@@ -127,7 +127,7 @@ def geometry_at(space: ParameterSpace, values: Float64[Tensor, " parameters"]) -
 
 def shared_joint_count(arm: ArmPosterior, other: ArmPosterior) -> int:
     """Return the number of joints of a torso that two arms share."""
-    pairs = zip(arm.torso, other.torso, strict=False)
+    pairs = zip(arm.torso_joints, other.torso_joints, strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 

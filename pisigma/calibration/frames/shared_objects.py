@@ -80,13 +80,13 @@ class ArmPosterior:
         uncertainty: its parameters, with the bases of its measuring frames and the unknowns of its sensors, and the
             weights of its joint correction.
         touches: its touches with other arms; None without any.
-        torso: names of its first joints, which it shares with other arms of one torso.
+        torso_joints: names of its first joints, which it shares with other arms of one torso.
     """
 
     name: str
     uncertainty: PositionUncertainty
     touches: Touches | None = None
-    torso: tuple[str, ...] = ()
+    torso_joints: tuple[str, ...] = ()
 
     @property
     def space(self) -> ParameterSpace:
@@ -103,7 +103,7 @@ class ArmPosterior:
         """Values of all parameters [m or rad]."""
         return self.uncertainty.geometry.values_of(self.space)
 
-    def base_rows(self, frame: str) -> range:
+    def base_indices(self, frame: str) -> range:
         """Return the indices of the parameters of the base in a frame."""
         first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
         return range(first, first + 6)
@@ -118,11 +118,11 @@ class ArmPosterior:
         determine one of its directions, because such a direction keeps its previous value and has no covariance.
         """
         names = [row.name for row in self.space.robot.rows]
-        found = {(JOINT, name): ("", tuple(range(5 * names.index(name)))) for name in self.torso}
+        found = {(JOINT, name): ("", tuple(range(5 * names.index(name)))) for name in self.torso_joints}
         found |= {
-            ("frame", frame): (frame, tuple(self.base_rows(frame)))
+            ("frame", frame): (frame, tuple(self.base_indices(frame)))
             for frame in self.space.frames
-            if frame and is_determined(self.covariance_root[list(self.base_rows(frame))])
+            if frame and is_determined(self.covariance_root[list(self.base_indices(frame))])
         }
         for group in self.space.unknowns:
             first, size = self.space.indices_of(group.name).start, len(group.columns)
@@ -133,7 +133,7 @@ class ArmPosterior:
         return found
 
     @property
-    def objects(self) -> tuple[tuple[str, str], ...]:
+    def shareable_object_keys(self) -> tuple[tuple[str, str], ...]:
         """Kind and name of everything that another arm could also have measured or touched."""
         touched = () if self.touches is None else self.touches.names
         return (*self.shared_objects, *((TOUCH, name) for name in touched))
@@ -144,7 +144,7 @@ class ArmPosterior:
         tips = () if self.touches is None else dict.fromkeys(self.touches.tips)
         return tuple(tip for tip in tips if tip not in self.space.targets)
 
-    def positions_in_base(
+    def tool_poses_in_base(
         self, postures: Postures, target: str | None = None, tip: Float64[Tensor, " 3"] | None = None
     ) -> tuple[Float64[Tensor, "postures 4 4"], Float64[Tensor, "postures 3 unknowns"]]:
         """Return poses of a tool in the base frame of the arm, and the derivatives of its positions.
@@ -202,8 +202,11 @@ def find_shared_objects(arms: Sequence[ArmPosterior]) -> tuple[SharedObject, ...
 
     Touches are last.
     """
-    keys = dict.fromkeys(itertools.chain.from_iterable(arm.objects for arm in arms))
-    found = (SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.objects)) for key in keys)
+    keys = dict.fromkeys(itertools.chain.from_iterable(arm.shareable_object_keys for arm in arms))
+    found = (
+        SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.shareable_object_keys))
+        for key in keys
+    )
     return tuple(sorted((one for one in found if len(one.arms) > 1), key=lambda one: one.kind == TOUCH))
 
 

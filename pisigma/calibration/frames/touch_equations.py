@@ -21,12 +21,12 @@ class TipPositions:
 
     Attributes:
         position: positions [m].
-        directions: derivatives along the directions of the arm's root.
+        position_derivatives: derivatives along the directions of the arm's root.
         rotation: rotation of the last row, by which an unknown tip moves with its coordinates.
     """
 
     position: Float64[Tensor, "touches 3"]
-    directions: Float64[Tensor, "touches 3 directions"]
+    position_derivatives: Float64[Tensor, "touches 3 directions"]
     rotation: Float64[Tensor, "touches 3 3"]
 
 
@@ -72,7 +72,7 @@ def _of_arm(number: int, arm: ArmPosterior, tips: dict[Tip, Tensor]) -> TipPosit
     directions = root.new_empty(count, 3, root.shape[1])
     for tip in dict.fromkeys(touches.tips):
         chosen = torch.tensor([one == tip for one in touches.tips])
-        T, columns = arm.positions_in_base(touches.postures[chosen], tip, tips.get((number, tip)))
+        T, columns = arm.tool_poses_in_base(touches.postures[chosen], tip, tips.get((number, tip)))
         position[chosen], turned[chosen], directions[chosen] = T[:, :3, 3], T[:, :3, :3], columns @ root
     return TipPositions(position, directions, turned)
 
@@ -108,9 +108,9 @@ def touch_equations(
             assert at is not None
             row, R = rows.names.index(one.name), T[number, :3, :3]
             first = sum(sizes[:number])
-            B[k, :, first : first + sizes[number]] = sign * R @ at.directions[row]
+            B[k, :, first : first + sizes[number]] = sign * R @ at.position_derivatives[row]
             away = R @ at.position[row]
-            closed[k] += sign * (T[number, :3, 3] + away + R @ at.directions[row] @ z[number])
+            closed[k] += sign * (T[number, :3, 3] + away + R @ at.position_derivatives[row] @ z[number])
             if number:
                 G[k, :, 6 * number - 6 : 6 * number] = sign * torch.cat([torch.eye(3).to(T), -skew(away)], 1)
             if (number, rows.tips[row]) in tips:

@@ -65,7 +65,7 @@ class WhitenedValues:
             row=torch.cat([one.row.repeat_interleave(one.components) for one, _ in scaled]),
             has_exact_noise=torch.cat(
                 [
-                    torch.full((len(one.row) * count,), one.is_stated)
+                    torch.full((len(one.row) * count,), one.are_values_given)
                     for (one, _), count in zip(scaled, by_component, strict=True)
                 ]
             ),

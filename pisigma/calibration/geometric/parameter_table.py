@@ -43,12 +43,12 @@ class PriorRatio:
     lower_bound: float
 
     @property
-    def size(self) -> float:
+    def error_sigma(self) -> float:
         """Estimated standard deviation of the errors [m or rad]."""
         return self.value * self.smallest_prior_sigma
 
     @property
-    def size_at_least(self) -> float:
+    def error_sigma_lower_bound(self) -> float:
         """The estimated standard deviation of the errors minus two of its own standard deviations [m or rad]."""
         return self.lower_bound * self.smallest_prior_sigma
 
@@ -99,7 +99,7 @@ class ParameterEstimate:
         change: estimated minus nominal value.
         standard_error: standard error of the estimate; NaN if it was not estimated.
         remark: "identified", the combination that is identified, or the reason why it was not estimated.
-        label: the remark in a few words, for tables.
+        short_remark: the remark in a few words, for tables.
     """
 
     name: str
@@ -109,7 +109,7 @@ class ParameterEstimate:
     change: float
     standard_error: float
     remark: str
-    label: str
+    short_remark: str
 
     @property
     def free(self) -> bool:

@@ -61,7 +61,7 @@ class SensorNoise:
         values: number of measured values.
         effective_parameters: effective number of parameters that are estimated from the values.
         rms: root mean square length of the residuals of all rows [m or rad].
-        quantity: "m" for lengths, "rad" for angles.
+        residual_unit: "m" for lengths, "rad" for angles.
         components: number of values per row.
     """
 
@@ -71,7 +71,7 @@ class SensorNoise:
     values: int
     effective_parameters: float
     rms: float
-    quantity: Literal["m", "rad"]
+    residual_unit: Literal["m", "rad"]
     components: int
 
 
@@ -149,15 +149,15 @@ class CalibrationResult:
         robot: the calibrated robot, with the base of the first frame and the tool of the first target.
         bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
         tools: tool of every target, in the same form.
-        unknowns: estimated unknowns of the sensors by group and owner, in the owner's frame: for a "socket" x, y, z
-            [m], for an "anchor" x, y, z and the reading of its sensor at distance zero [m].
+        sensor_unknowns: estimated unknowns of the sensors by group and owner, in the owner's frame: for a "socket" x,
+            y, z [m], for an "anchor" x, y, z and the reading of its sensor at distance zero [m].
         solved: the problem with its solution.
     """
 
     robot: Robot
     bases: dict[str, Float64[np.ndarray, " 6"]]
     tools: dict[str, Float64[np.ndarray, " 6"]]
-    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
+    sensor_unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
     solved: SolvedCalibration
 
     @cached_property
@@ -315,7 +315,7 @@ class CalibrationResult:
         Raises:
             IdentificationError: a row has a frame, a target or an anchor that was not calibrated.
         """
-        return measured_errors(self.predicted_poses(measurements), measurements, self.unknowns)
+        return measured_errors(self.predicted_poses(measurements), measurements, self.sensor_unknowns)
 
 
 def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
@@ -353,7 +353,7 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
     view = contributions_and_noise_of(solved.refined_linearisation)
     for number, (sensor, part) in enumerate(zip(solved.problem.sensors, view.contributions, strict=True)):
-        deviations = part.residual_length / view.scales[number]
+        deviations = part.residual_length / view.loss_scales[number]
         weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
         found += outliers_of(
@@ -380,7 +380,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
                 values=problem.measured_value_counts[k],
                 effective_parameters=used[k],
                 rms=float(part.rms),
-                quantity=sensor.unit,
+                residual_unit=sensor.unit,
                 components=sensor.components,
             )
         )

@@ -148,7 +148,7 @@ class HybridCalibrator:
         progress("solving for all parameters")
         whole = solved.problem.rows == choice.rows.problem.rows
         refined = serving.refined if whole else refine(solved.problem, group, choice)
-        if refined.regression.effective_share(refined.posterior) > choice.best.max_effective_share:
+        if refined.regression.absorbed_share(refined.posterior) > choice.best.max_effective_share:
             return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
         falling = gravity_sentence(self.geometric_calibrator.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
@@ -198,20 +198,20 @@ class HybridCalibrator:
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
         distances = [
-            one.residual.norm(dim=1) * one.weight_root / view.scales[k] for k, one in enumerate(values)
+            one.residual.norm(dim=1) * one.weight_root / view.loss_scales[k] for k, one in enumerate(values)
         ]
         weights = [
-            ((distance < _GROSS) | one.is_stated).to(distance)
+            ((distance < _GROSS) | one.are_values_given).to(distance)
             for distance, one in zip(distances, values, strict=True)
         ]
         rows = LinearisedRows.from_linearisation(
             design, (point - problem.prior_mean)[problem.active], values, weights, group
         )
         pairs = zip(noise, values, strict=True)
-        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.is_stated):
+        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.are_values_given):
             # The geometry explains exact data, so features would only fit the errors of the linearisation.
             search = FeatureSearch(rows, noise, prior_scale, [], progress)
-            return search.try_derived_feature(search.geometry, None)
+            return search.try_derived_feature(search.fit_without_features, None)
         robot = self.geometric_calibrator.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
@@ -294,7 +294,7 @@ def _kept_sentence(serving: FinalCorrection) -> str:
 def _geometric_alone(solved: SolvedCalibration, choice: FeatureChoice, verdict: str) -> HybridResult:
     """Return the geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
-    first = choice.geometry
+    first = choice.fit_without_features
     fit = build_regression(first.design, choice.rows)
     uncertainty = position_uncertainty(
         choice.rows, first.design, fit, first.posterior, geometry, first.held_out_errors

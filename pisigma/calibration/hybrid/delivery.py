@@ -82,12 +82,12 @@ class Comparison:
     Attributes:
         fitted_ratio: ratio of the RMS errors of all rows.
         held_out_ratio: ratio of the RMS errors of held-out rows.
-        gain: decrease of the held-out squares [standard errors], with independent groups.
+        gain_in_standard_errors: decrease of the held-out squares [standard errors], with independent groups.
     """
 
     fitted_ratio: float
     held_out_ratio: float
-    gain: float
+    gain_in_standard_errors: float
 
     @property
     def is_worse(self) -> bool:
@@ -145,7 +145,7 @@ def held_out_row_errors(
             errors[chosen] = (one.residual.norm(dim=1) * one.weight_root)[chosen]
     return tuple(
         None
-        if one.is_stated
+        if one.are_values_given
         else SensorErrors(group[one.row], one.residual.norm(dim=1) * one.weight_root, *errors)
         for one, *errors in zip(values, held_out, weights, strict=True)
     )
@@ -170,7 +170,7 @@ def _with_own_unknowns(
     """Fit unknowns on which only held-out rows depend to these rows, starting with their values from all rows."""
     moving = torch.zeros(design.active_count, dtype=torch.bool, device=x.device)
     for one in values:
-        if not one.is_stated:
+        if not one.are_values_given:
             moving |= (one.geometry_derivatives[~held[one.row]] != 0).flatten(0, 1).any(0)
     own = (~moving).nonzero()[:, 0]
     if not len(own):
@@ -179,7 +179,7 @@ def _with_own_unknowns(
     for _ in range(_REFITS):
         blocks = []
         for one in _values(design, x):
-            chosen = held[one.row] | one.is_stated
+            chosen = held[one.row] | one.are_values_given
             columns = one.geometry_derivatives[chosen][..., own] * one.weight_root[chosen][:, None, None]
             errors = one.residual[chosen] * one.weight_root[chosen][:, None]
             blocks.append((columns.flatten(0, 1), errors.flatten()))
@@ -246,14 +246,16 @@ def choose_final_correction(
         refined = refine(problem, choice.rows.group, part)
         errors = held_out_row_errors(refined.design, refined.posterior, group, folds, updates)
         compared = _compared(errors, before)
-        if not any(one.is_worse for one in compared) and any(one.gain > CLEAR_GAIN for one in compared):
+        if not any(one.is_worse for one in compared) and any(
+            one.gain_in_standard_errors > CLEAR_GAIN for one in compared
+        ):
             return FinalCorrection(part, refined, min(one.held_out_ratio for one in compared))
     return None
 
 
 def _held_out_in_search(choice: FeatureChoice) -> float:
     """Return the ratio of held-out errors that the search computed with linearised rows."""
-    return [trial.held_out_ratio for trial in choice.trials if trial.kept][-1]
+    return [trial.held_out_ratio for trial in choice.trials if trial.is_best_so_far][-1]
 
 
 def _compared(errors: Errors, before: Errors) -> list[Comparison]:
@@ -267,7 +269,7 @@ def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Po
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), contributions_and_noise_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.prior_mean)[problem.active]
-    rows = linearise_rows(design, x, choice.geometry.posterior.effective_unknowns, group)
+    rows = linearise_rows(design, x, choice.fit_without_features.posterior.effective_unknowns, group)
     prior = design.prior(view.prior_scale.tolist())
     return build_regression(design, rows).solve(prior, tuple(view.noise.tolist()))
 
@@ -284,6 +286,6 @@ def _part(choice: FeatureChoice, features: tuple[AbstractFeature, ...]) -> Featu
     """Return the choice with a subset of its features as the best fit."""
     best, design = choice.best, Design(choice.rows.problem, features)
     fit = (choice.regression or build_regression(best.design, choice.rows)).select(design)
-    prior = design.prior_with_sizes_of(best.design, best.posterior.prior)
+    prior = design.prior_with_scales_of(best.design, best.posterior.prior)
     posterior = fit.maximise_evidence(prior, best.posterior.noise, tolerance=ROUGH_TOLERANCE)
     return replace(choice, best=FeatureFit(design, posterior, best.max_effective_share), regression=fit)

@@ -115,21 +115,26 @@ class Design:
         prior = self.prior(prior_scale)
         sizes = [size for chosen in self.features for size in chosen.usual_sizes]
         return replace(
-            prior, sizes=torch.cat([prior.sizes[: prior.class_count], prior.sizes.new_tensor(sizes)])
+            prior,
+            group_scales=torch.cat(
+                [prior.group_scales[: prior.geometric_class_count], prior.group_scales.new_tensor(sizes)]
+            ),
         )
 
-    def prior_with_sizes_of(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
-        """Return a prior with the fitted sizes of another design; new bands get the size of its last band."""
-        prior_here = self.prior(prior.sizes[: prior.class_count].tolist())
-        sizes = prior_here.sizes.clone()
-        others = zip(other.features, other.first_scale_indices(prior.class_count), strict=True)
+    def prior_with_scales_of(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
+        """Return a prior with the fitted scales of another design; new bands get the scale of its last band."""
+        prior_here = self.prior(prior.group_scales[: prior.geometric_class_count].tolist())
+        sizes = prior_here.group_scales.clone()
+        others = zip(other.features, other.first_scale_indices(prior.geometric_class_count), strict=True)
         fitted = {like.name: (first, len(like.group_names)) for like, first in others}
-        for chosen, start in zip(self.features, self.first_scale_indices(prior.class_count), strict=True):
+        for chosen, start in zip(
+            self.features, self.first_scale_indices(prior.geometric_class_count), strict=True
+        ):
             if chosen.name in fitted:
                 first, count = fitted[chosen.name]
                 for number in range(len(chosen.group_names)):
-                    sizes[start + number] = prior.sizes[first + min(number, count - 1)]
-        return replace(prior_here, sizes=sizes)
+                    sizes[start + number] = prior.group_scales[first + min(number, count - 1)]
+        return replace(prior_here, group_scales=sizes)
 
     def first_scale_indices(self, geometric_class_count: int) -> list[int]:
         """Return the index of the first prior scale of every feature."""
@@ -180,7 +185,7 @@ class LinearisedRows:
             SensorValueCount(
                 sensor.residual.numel() / sensor.repeat_variance_factor,
                 sensor.has_stated_noise,
-                sensor.is_stated,
+                sensor.are_values_given,
                 sensor.repeat_variance_factor,
             )
             for sensor in self.values
@@ -196,7 +201,7 @@ class LinearisedRows:
     def held_out_rows(self, groups: Int64[Tensor, " chosen"]) -> "LinearisedRows":
         """Return the rows of the given groups, without sensors whose values are given."""
         rows = self.select_groups(groups)
-        kept = [sensor.select(slice(0, 0)) if sensor.is_stated else sensor for sensor in rows.values]
+        kept = [sensor.select(slice(0, 0)) if sensor.are_values_given else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
     def folds(self, count: int, max_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
@@ -280,7 +285,7 @@ def robust_weights(
         IdentificationError: a residual is not finite.
     """
     weights = []
-    counts = [0.0 if sensor.is_stated else float(sensor.residual.numel()) for sensor in values]
+    counts = [0.0 if sensor.are_values_given else float(sensor.residual.numel()) for sensor in values]
     for number, sensor in enumerate(values):
         loss = problem.loss_for_sensor(problem.sensors[number])
         distance = sensor.residual.norm(dim=1) * sensor.weight_root
@@ -290,7 +295,7 @@ def robust_weights(
                 value=sensor.name,
                 remedy="calibrate the geometry alone, and look for huge values in the measurements",
             )
-        if sensor.is_stated or isinstance(loss, SquaredLoss):
+        if sensor.are_values_given or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))
             continue
         taken = effective_unknowns * counts[number] / max(sum(counts), 1.0)

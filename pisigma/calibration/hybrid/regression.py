@@ -126,7 +126,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         # needs the columns up to its end.
         M = torch.eye(first, dtype=x.dtype, device=x.device)
         for rows in row_blocks(len(x), BLOCK):
-            S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
+            S = solved.inverse_factor[rows, : rows.stop] @ whitened[:, : rows.stop].t()
             M.addmm_(S.t(), S, alpha=-1)
         return HeldOutErrors.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
 
@@ -148,7 +148,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         )
         # Schur complement: the remainder of the new columns after fitting the old columns.
         cross = normal[:, old]
-        root = solved.inverse @ (cross * solved.scale).t()
+        root = solved.inverse_factor @ (cross * solved.scale).t()
         rest = square - float(descent[old] @ solved.x)
         # The remaining squares have unit noise, because sensors were already weighted by their noise.
         alone = PrimalRegression(
@@ -162,17 +162,17 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         prior = GaussianPrior(
             whole.unit_precision[design.unknowns :],
             whole.group[design.unknowns :] - first,
-            whole.sizes[first:],
+            whole.group_scales[first:],
             0,
         )
         best = alone.maximise_evidence(prior, (1.0,))
-        return best.log_evidence + rest / 2, best.prior.sizes
+        return best.log_evidence + rest / 2, best.prior.group_scales
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
     """Add the normal matrix and right-hand side of a sensor's values in place; return the sum of the squared values."""
     active, dof = design.active_count, sensor.joint_derivatives.shape[-1]
-    count = sum(chosen.count for chosen in design.features)
+    count = sum(chosen.column_count for chosen in design.features)
     size = active + dof * count
     normal = sensor.weight_root.new_zeros((size, size))
     descent, square, weight = normal.new_zeros(size), 0.0, sensor.weight_root.square()
@@ -228,9 +228,9 @@ def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
     """Return the positions of the used weights in an order by joint, feature and column."""
     first, places = 0, [torch.zeros(0, dtype=torch.int64)]
     for chosen in design.features:
-        own = torch.arange(dof)[:, None] * count + first + torch.arange(chosen.count)
+        own = torch.arange(dof)[:, None] * count + first + torch.arange(chosen.column_count)
         places.append(own[chosen.used])
-        first += chosen.count
+        first += chosen.column_count
     return torch.cat(places)
 
 
@@ -260,7 +260,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             X = design.columns(sensor, slice(None))
             root = sensor.weight_root[:, None]
             y = sensor.residual * root
-            group = torch.full_like(sensor.row, -1) if sensor.is_stated else rows.group[sensor.row]
+            group = torch.full_like(sensor.row, -1) if sensor.are_values_given else rows.group[sensor.row]
             parts.append(
                 (
                     (X * root[..., None]).flatten(0, 1),
@@ -271,7 +271,10 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             )
         X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
         prior = design.prior((1.0,) * design.class_count)
-        K = [group_gram(X, prior, g, design.active_count) for g in range(prior.class_count, len(prior.sizes))]
+        K = [
+            group_gram(X, prior, g, design.active_count)
+            for g in range(prior.geometric_class_count, len(prior.group_scales))
+        ]
         return ValueCovariance(
             X, y, number, prior, design.active_count, stack_groups(K, y), rows.sensors, design, rows, group
         )
@@ -282,12 +285,14 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         X, prior = self.X[:, columns], design.prior((1.0,) * design.class_count)
         before = self.prior.group[columns]
         K = []
-        for g in range(prior.class_count, len(prior.sizes)):
+        for g in range(prior.geometric_class_count, len(prior.group_scales)):
             members = (prior.group == g).nonzero()[:, 0]
-            other = int(before[members[0]]) if len(members) else prior.class_count
+            other = int(before[members[0]]) if len(members) else prior.geometric_class_count
             whole = 0 < len(members) == int((self.prior.group == other).sum())
             K.append(
-                self.K[other - prior.class_count] if whole else group_gram(X, prior, g, design.active_count)
+                self.K[other - prior.geometric_class_count]
+                if whole
+                else group_gram(X, prior, g, design.active_count)
             )
         return replace(self, design=design, X=X, prior=prior, K=stack_groups(K, self.y))
 

@@ -68,7 +68,7 @@ class Trial:
         log_evidence: log evidence up to a constant of the data.
         held_out_ratio: ratio of the held-out RMS error to that of the geometric calibration [1].
         seconds: duration [s].
-        kept: whether the trial was better than all previous trials.
+        is_best_so_far: whether the trial was better than all previous trials.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Trial:
     log_evidence: float
     held_out_ratio: float
     seconds: float
-    kept: bool
+    is_best_so_far: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +100,13 @@ class FeatureFit:
         """Labels of the features, for tables."""
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
-    def gain(self, before: "FeatureFit") -> float:
+    def gain_in_standard_errors(self, before: "FeatureFit") -> float:
         """Compute the decrease of the held-out squared errors from another fit [standard errors]; 0 without any."""
         if self.held_out_errors is None or before.held_out_errors is None:
             return 0.0
-        return self.held_out_errors.gain(self.posterior.noise, before.held_out_errors, before.posterior.noise)
+        return self.held_out_errors.gain_in_standard_errors(
+            self.posterior.noise, before.held_out_errors, before.posterior.noise
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +115,14 @@ class FeatureChoice:
 
     Attributes:
         rows: rows used for the selection.
-        geometry: fit without features.
+        fit_without_features: fit without features.
         best: fit with the chosen features.
         trials: the trials, in order.
         regression: regression of the rows on the best design, if available.
     """
 
     rows: LinearisedRows
-    geometry: FeatureFit
+    fit_without_features: FeatureFit
     best: FeatureFit
     trials: tuple[Trial, ...]
     regression: AbstractDesignRegression | None = None
@@ -154,9 +156,9 @@ class FeatureSearch:
         self._order = [one.name for one in largest]
         self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
         began = time.monotonic()
-        self.geometry, self._unit = self.fit_features(())
+        self.fit_without_features, self._unit = self.fit_features(())
         self._least = self._unit
-        self._note(self.geometry, 1.0, began, True)
+        self._note(self.fit_without_features, 1.0, began, True)
 
     def fit_features(
         self,
@@ -179,10 +181,10 @@ class FeatureSearch:
         if start is not None:
             noise, prior = (
                 start.posterior.noise,
-                design.prior_with_sizes_of(start.design, start.posterior.prior),
+                design.prior_with_scales_of(start.design, start.posterior.prior),
             )
         if sizes is not None:
-            prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
+            prior = replace(prior, group_scales=torch.cat([prior.group_scales[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGH_TOLERANCE)
         errors = chosen.held_out_errors(posterior, self._folds)
@@ -210,7 +212,7 @@ class FeatureSearch:
                 help.
             final_features: features that are tried at the end; they must clearly reduce the held-out errors.
         """
-        best = self.geometry
+        best = self.fit_without_features
         for chosen in other_features:
             best = self._tried([*best.design.features, chosen], best)
         before, failures, grown = best.design.features, 0, False
@@ -253,7 +255,7 @@ class FeatureSearch:
             best = self._tried(largest, best, odds=log_odds_against)
         same = self._regression.design.features == best.design.features
         return FeatureChoice(
-            self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None
+            self.rows, self.fit_without_features, best, tuple(self.trials), self._regression if same else None
         )
 
     def _tried(
@@ -273,8 +275,8 @@ class FeatureSearch:
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEAR_EVIDENCE + odds
             and held_out < self._least * _LEVEL
-            and tried.gain(best) > least_gain
-            and self._regression.effective_share(tried.posterior) < _MAX_EFFECTIVE_SHARE
+            and tried.gain_in_standard_errors(best) > least_gain
+            and self._regression.absorbed_share(tried.posterior) < _MAX_EFFECTIVE_SHARE
         )
         self._note(tried, held_out / self._unit, began, better)
         if better:
@@ -300,7 +302,7 @@ class FeatureSearch:
             posterior.log_evidence - best.posterior.log_evidence
             > (_STRONG_EVIDENCE if best.design.features else CLEAR_EVIDENCE)
             and held_out < self._least * _LEVEL
-            and fit.effective_share(posterior) < MAX_USUAL_SHARE
+            and fit.absorbed_share(posterior) < MAX_USUAL_SHARE
         )
         tried = FeatureFit(design, posterior, MAX_USUAL_SHARE, errors)
         self._note(tried, held_out / self._unit, began, better)

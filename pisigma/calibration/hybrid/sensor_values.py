@@ -31,7 +31,7 @@ class SensorValues:
         residual: measured minus predicted values.
         weight_root: 1 / standard deviation if the rows state it, otherwise 1.
         has_stated_noise: whether the rows state their standard deviations.
-        is_stated: whether the values are given, not measured.
+        are_values_given: whether the values are given, not measured.
         other_row: index of the other row for distances between the targets of two rows; otherwise None.
         other_joint_derivatives: derivative with respect to the joint values of the other row.
         repeat_variance_factor: factor >= 1 on the variance, because values of several targets in one configuration
@@ -45,7 +45,7 @@ class SensorValues:
     residual: Float64[Tensor, "values components"]
     weight_root: Float64[Tensor, " values"]
     has_stated_noise: bool
-    is_stated: bool
+    are_values_given: bool
     other_row: Int64[Tensor, " values"] | None = None
     other_joint_derivatives: Float64[Tensor, "values components dof"] | None = None
     repeat_variance_factor: float = 1.0
@@ -132,7 +132,7 @@ class SensorValues:
 
     def downweight_correlated(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
         """Return the rows with smaller weights if residuals of several targets in a configuration are correlated."""
-        if not len(self.row) or self.is_stated or self.other_row is not None:
+        if not len(self.row) or self.are_values_given or self.other_row is not None:
             return self
         key = renumber(configuration[self.row])
         groups = int(key.max()) + 1
@@ -217,7 +217,7 @@ def sensor_values(
                 residual=r.contiguous(),
                 weight_root=root,
                 has_stated_noise=sensor.sigma is not None,
-                is_stated=sensor.is_stated,
+                are_values_given=sensor.is_stated,
                 other_row=row + 1 if paired else None,
                 other_joint_derivatives=other * direction if paired else None,
             )

@@ -61,7 +61,7 @@ def _slope_and_curvature(
     """Return first and negative second derivatives of the rows' log likelihood with respect to the joint values."""
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
-        if not sensor.is_stated:
+        if not sensor.are_values_given:
             weight = (sensor.weight_root / sigma).square()[:, None]
             residual = sensor.residual - design.predicted_change(sensor, posterior.x)
             for row, joints in sensor.row_derivatives:

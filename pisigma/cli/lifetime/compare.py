@@ -118,7 +118,7 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     """Return the verdict: how much two models differ, and which is better."""
     first, second = compared.models
     errors = compared.workspace_displacement.errors.figures.figures_by_name
-    count, better = len(compared.parameters.differing), compared.better_model
+    count, better = len(compared.parameters.significant_differences), compared.better_model
     which = (
         f"the arms differ in {count_text(count, 'parameter')}"
         if count

@@ -110,8 +110,8 @@ class Exported:
         facts: values for `--json`, by key.
         remarks: sentences for the reader of the file.
         warnings: warnings, which are printed to stderr.
-        summary: sentence about the written file, up to its name; "" for the contents of the format.
-        details: remainder of this sentence after the file's name.
+        sentence_start: sentence about the written file, up to its name; "" for the contents of the format.
+        sentence_end: remainder of this sentence after the file's name.
         failure: fault of the input, although the file was written; None if there is none.
         missed_limit: sentence about a missed limit, although the file was written; None if no limit is missed.
         leading_text: text that is printed first, such as a diff.
@@ -121,8 +121,8 @@ class Exported:
     facts: Mapping[str, object]
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    summary: str = ""
-    details: str = ""
+    sentence_start: str = ""
+    sentence_end: str = ""
     failure: str | None = None
     missed_limit: str | None = None
     leading_text: str = ""

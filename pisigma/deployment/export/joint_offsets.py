@@ -29,19 +29,22 @@ class JointOffsets:
         values: offset of every axis of the controller [rad or m], in the direction of the axis: the real robot
             commanded to q is where the nominal robot is at q + offset.
         unobservable: joints whose offset is set to 0 because base or tool have the same effect.
-        departure: remaining deviation from the whole model.
+        remaining_deviation: remaining deviation from the whole model.
         nominal: deviation of the nominal robot with the model's base and tool, for comparison.
     """
 
     robot: Robot
     values: Float64[np.ndarray, " axes"]
     unobservable: tuple[str, ...]
-    departure: ToolDeviation
+    remaining_deviation: ToolDeviation
     nominal: ToolDeviation
 
     def departures(self) -> dict[str, object]:
         """Return both deviations, by their keys in files."""
-        return {"off_the_whole_model": asdict(self.departure), "robot_as_drawn": asdict(self.nominal)}
+        return {
+            "off_the_whole_model": asdict(self.remaining_deviation),
+            "robot_as_drawn": asdict(self.nominal),
+        }
 
 
 def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
@@ -59,7 +62,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
         unobservable=tuple(
             j.name for j, free in zip(nominal.joints, fit.observable, strict=True) if not free
         ),
-        departure=fit.deviation_of(fit.robot),
+        remaining_deviation=fit.deviation_of(fit.robot),
         nominal=fit.deviation_of(nominal),
     )
 
@@ -115,7 +118,10 @@ def departure_sentence(
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     """Return sentences on the meaning of the offsets and their loss of accuracy."""
-    sentences = [_MEANING, departure_sentence("Offsets alone deviate", offsets.departure, offsets.nominal)]
+    sentences = [
+        _MEANING,
+        departure_sentence("Offsets alone deviate", offsets.remaining_deviation, offsets.nominal),
+    ]
     if offsets.unobservable:
         sentences.append(
             f"Offsets of {', '.join(offsets.unobservable)} are 0 because the base or the tool has the same effect."

@@ -296,8 +296,8 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
     check_same_geometry_as_nominal(
         differences, _SAME, path, "give the MJCF file of this robot, with the same joints"
     )
-    frames = [there @ inverse(here) for there, here in zip(drawn.frames, own.frames, strict=True)]
-    return [drawn.frames[0] @ start @ inverse(own.frames[0]), *frames[1:]]
+    frames = [there @ inverse(here) for there, here in zip(drawn.T_joint_row, own.T_joint_row, strict=True)]
+    return [drawn.T_joint_row[0] @ start @ inverse(own.T_joint_row[0]), *frames[1:]]
 
 
 def _without_rounding(T: Frame) -> Frame:

@@ -127,7 +127,7 @@ def _write(request: ExportRequest) -> Exported:
     text = rsi_configuration(address.host, address.port, comments)
     facts = model_facts(model) | {"address": f"{address.host}:{address.port}"}
     remarks = (*comments, *_REMARKS, *((SET_ADDRESS,) if request.like is None else ()))
-    return Exported(text, facts, remarks, summary="RSI configuration")
+    return Exported(text, facts, remarks, sentence_start="RSI configuration")
 
 
 FORMAT = ExportFormat(

@@ -82,7 +82,7 @@ def targets_csv(targets: Targets) -> str:
     writer.writerow(("line", "status", "branch", *joint_columns(targets.robot), *POSE_COLUMNS, "sigma_mm"))
     turns = torch.tensor([axis.type == "revolute" for axis in targets.robot.axes])
     q = torch.where(turns, torch.rad2deg(targets.q), targets.q * 1e3)
-    pose = millimetres_and_euler(targets.T)
+    pose = millimetres_and_euler(targets.T_nominal)
     # The safe angle functions return finite angles for a matrix of NaN, so the gaps are taken from q.
     pose = torch.where(torch.isfinite(q).all(-1, keepdim=True), pose, torch.nan)
     values = torch.cat([q, pose, targets.sigma[:, None] * 1e3], -1).tolist()
@@ -162,8 +162,8 @@ def _write(request: ExportRequest) -> Exported:
             *([targets.domain_warning] if targets.domain_warning else []),
             *(() if table else cautions(request.out, cartesian)),
         ),
-        summary=f"Targets for {len(targets.line)} poses",
-        details=": " + ", ".join(f"{count} {status}" for status, count in statuses),
+        sentence_start=f"Targets for {len(targets.line)} poses",
+        sentence_end=": " + ", ".join(f"{count} {status}" for status, count in statuses),
         failure=targets.failure_sentence,
     )
 
@@ -269,7 +269,7 @@ def _exported(
             *(language.cartesian_cautions if language else ()),
             *_warnings(corrected, str(request.program)),
         ),
-        summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
+        sentence_start=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.waypoint_count} waypoints",
         missed_limit=_shortfall(corrected, str(request.program)),
         leading_text=diff,

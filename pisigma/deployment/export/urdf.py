@@ -197,7 +197,7 @@ def update_urdf(
         next(elements[urdf.parent_map[chain.base][0]].iterchildren("{*}child")).set("link", mount)
     frame = _add_link(root, CALIBRATED_FRAME, mount, inverse(T_frame_base))
     _add_joint(root, frame, (frame, chain.base), T_frame_base)
-    _add_link(root, CALIBRATED_TOOL, chain.tip, inverse(chain.end) @ rows.frames[-1] @ last)
+    _add_link(root, CALIBRATED_TOOL, chain.tip, inverse(chain.end) @ rows.T_joint_row[-1] @ last)
     for sentence in reversed(comments):
         root.insert(0, etree.Comment(comment_text(sentence)))
     etree.indent(root)
@@ -253,7 +253,9 @@ def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) ->
     """Compute the origins of the movable joints in the preceding links, except for the first."""
     origins: dict[str, Frame] = {}
     for i, joint in enumerate(chain.joints[1:], 1):
-        whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
+        whole = (
+            rows.T_joint_row[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.T_joint_row[i])
+        )
         # Fixed joints in between remain; their product precedes the origin of the joint.
         before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
         origins[joint.name] = inverse(before) @ whole

@@ -38,9 +38,9 @@ class LeRobotCorrection:
         model: calibrated model.
         units: units of the values.
         names: names of the values of a frame, in their order.
-        joints: index of the value of every joint of the robot in a frame.
+        joint_value_indices: index of the value of every joint of the robot in a frame.
         scale: rotation [rad] per unit of the value, for every joint.
-        offset: offset of every value of a frame [in its unit], 0 for values that are not joints.
+        value_offsets: offset of every value of a frame [in its unit], 0 for values that are not joints.
         offsets: the joint offsets, with the deviation that they leave.
         prefix: prefix of the motor names of this arm, such as "left_".
         motors: motors in the arm's calibration file, by name; None if it is not known.
@@ -50,9 +50,9 @@ class LeRobotCorrection:
     model: "CalibratedModel"
     units: LeRobotUnits
     names: tuple[str, ...]
-    joints: tuple[int, ...]
+    joint_value_indices: tuple[int, ...]
     scale: Float64[np.ndarray, " axes"]
-    offset: Float64[np.ndarray, " values"]
+    value_offsets: Float64[np.ndarray, " values"]
     offsets: JointOffsets
     prefix: str
     motors: Mapping[str, Motor] | None
@@ -114,19 +114,19 @@ class LeRobotCorrection:
         Raises:
             MeasurementError: the last axis does not have one value per name, or a name is missing.
         """
-        return self._moved(recorded_values, self.offset)
+        return self._moved(recorded_values, self.value_offsets)
 
     def commands(self, true_values: Any) -> Any:
         """Compute the joint values to command for true joint values; the inverse of `true_values`.
 
         LeRobot limits normalized values to -100 to 100 when it sends them, so an arm stops there.
         """
-        return self._moved(true_values, -self.offset)
+        return self._moved(true_values, -self.value_offsets)
 
     def joint_values(self, recorded_values: Any) -> Float64[np.ndarray, "*batch axes"]:
         """Convert frames `(*batch, values)` to the robot's joint values [rad]."""
         array = self._checked(np.asarray(recorded_values, dtype=np.float64))
-        values: np.ndarray = array[..., list(self.joints)] * self.scale
+        values: np.ndarray = array[..., list(self.joint_value_indices)] * self.scale
         return values
 
     def poses(self, recorded_values: Any) -> Float64[np.ndarray, "*batch 4 4"]:
@@ -149,13 +149,15 @@ class LeRobotCorrection:
         self, frame: Mapping[str, Any], offset: Float64[np.ndarray, " values"]
     ) -> dict[str, Any]:
         """Return a dictionary with the offsets added to the values; all entries keep their order."""
-        if missing := [self.names[index] for index in self.joints if self.names[index] not in frame]:
+        if missing := [
+            self.names[index] for index in self.joint_value_indices if self.names[index] not in frame
+        ]:
             raise MeasurementError(
-                expected=f"the values {', '.join(self.names[index] for index in self.joints)}",
+                expected=f"the values {', '.join(self.names[index] for index in self.joint_value_indices)}",
                 value=Phrase(", ".join(frame)),
                 remedy=f"add {missing[0]}",
             )
-        moved = {self.names[index] for index in self.joints}
+        moved = {self.names[index] for index in self.joint_value_indices}
         by_name = dict(zip(self.names, offset, strict=True))
         return {
             name: _sum(_checked_type(value, name), by_name[name]) if name in moved else value

@@ -153,10 +153,14 @@ def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection
     frames = 0
     for file, table in source.tables():
         for key, correction in corrections.items():
-            recorded = source.frames(table, key, file)
+            recorded = source.feature_values(table, key, file)
             names = [axis.name for axis in correction.model.robot.axes]
             check_values(
-                recorded[:, list(correction.joints)], correction.units, names, correction.motors, file
+                recorded[:, list(correction.joint_value_indices)],
+                correction.units,
+                names,
+                correction.motors,
+                file,
             )
             values = correction.true_values(recorded)
             table = _with_column(table, key, values.reshape(-1))
@@ -195,7 +199,7 @@ def _with_statistics(table: "pyarrow.Table", corrections: dict[str, LeRobotCorre
             if name in table.column_names:
                 flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
                 table = _with_column(
-                    table, name, (flat.reshape(len(table), -1) + correction.offset).reshape(-1)
+                    table, name, (flat.reshape(len(table), -1) + correction.value_offsets).reshape(-1)
                 )
     return table
 
@@ -220,4 +224,4 @@ def _move(statistics: dict[str, Any], corrections: dict[str, LeRobotCorrection])
     for key, correction in corrections.items():
         entry = statistics.get(key, {})
         for kind in set(STATISTICS) & set(entry):
-            entry[kind] = (np.array(entry[kind]) + correction.offset).tolist()
+            entry[kind] = (np.array(entry[kind]) + correction.value_offsets).tolist()

@@ -85,7 +85,7 @@ class ServedModel:
     @cached_property
     def has_compiled_solver(self) -> bool:
         """Whether compiled kernels solve poses in microseconds; for coupled joints, they do so in DH values."""
-        controller = self.ik.controller
+        controller = self.ik.controller_solver
         if controller is None:
             return self.ik.compiled is not None
         return controller.ik.compiled is not None and not controller.coupling.has_passive_joints
@@ -112,7 +112,7 @@ class ServedModel:
     @cached_property
     def byte_solver(self) -> CompiledIK | None:
         """Return the kernels if they can solve poses directly from the bytes of a message, otherwise None."""
-        return self.ik.compiled if self.ik.controller is None and sys.byteorder == "little" else None
+        return self.ik.compiled if self.ik.controller_solver is None and sys.byteorder == "little" else None
 
     def solve(self, T_base_tool: bytes, near: bytes) -> list[float]:
         """Solve a pose that is given as little-endian bytes; the status of an invalid pose is INVALID_POSE.
@@ -296,7 +296,7 @@ class ServedModels:
         A model that cannot be reloaded continues to answer as before.
         """
         if self._in_use is not None:
-            self._in_use.check(retry_failed=True)
+            self._in_use.load_if_changed(retry_failed=True)
             return list(self._in_use.warnings)
         with self._lock:
             problems: list[str] = []

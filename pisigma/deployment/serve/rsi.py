@@ -184,7 +184,7 @@ class RsiAnswers:
 
 def _kernels(ik: CorrectedIK) -> CompiledIK:
     """Return the kernels of a model after a first solution, which compiles whatever is missing."""
-    if ik.compiled is None or ik.controller is not None:
+    if ik.compiled is None or ik.controller_solver is not None:
         raise ModelError(
             f"model '{ik.name}' has no compiled form, so it cannot answer within a cycle",
             option="--rsi",

@@ -26,7 +26,8 @@ class MeasuredAccuracy:
         session: name of the session.
         day: day of the session (ISO 8601).
         rows: number of rows.
-        fitted: "base" or "tool" or both, if they were changed after the calibration and therefore fitted to the rows.
+        fitted_frames: "base" or "tool" or both, if they were changed after the calibration and therefore fitted to the
+            rows.
         errors: position errors of the model in use [mm].
         distrust_reason: reason why the rows must not be trusted; empty if they can be trusted.
     """
@@ -34,7 +35,7 @@ class MeasuredAccuracy:
     session: str
     day: str
     rows: int
-    fitted: tuple[str, ...]
+    fitted_frames: tuple[str, ...]
     errors: QuantityErrors
     distrust_reason: str = ""
 
@@ -49,7 +50,7 @@ class MeasuredAccuracy:
             "session": self.session,
             "day": self.day,
             "rows": self.rows,
-            "fitted": list(self.fitted),
+            "fitted": list(self.fitted_frames),
             "position_mm": dict(self.errors.statistics),
             "axes_mm": {name: dict(axis) for name, axis in self.errors.axes.items()},
             "distrust_reason": self.distrust_reason,

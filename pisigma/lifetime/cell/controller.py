@@ -140,7 +140,7 @@ class ControllerHistory:
         return self.active_exports(session.day, session.taken_in)
 
     @property
-    def zero_changes(self) -> tuple[ControllerEntry, ...]:
+    def joint_zero_changes(self) -> tuple[ControllerEntry, ...]:
         """Changes of the joint zeros."""
         hashes = [_hash(self.active_exports(one.day, one.recorded)) for one in self.changes]
         pairs = zip(self.changes, ["", *hashes], hashes, strict=False)
@@ -161,7 +161,7 @@ class ControllerHistory:
             else self.active_exports(model.day or day_of(model.made), model.made)
         )
 
-    def fits(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
+    def matches_model(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
         """Return whether the joint zeros that are active now are those with which the rows of a model were measured."""
         return _hash(self.active_when_fitted(model, sessions)) == _hash(self.active_exports())
 

@@ -59,7 +59,7 @@ class CellFacts:
         settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
         changed_models: names of the model in use and of the newest model, if these were changed or removed after they
             were made.
-        measured_pose_text: number of measured poses of the newest plan as text, if there are too few; otherwise "".
+        too_few_poses_text: number of measured poses of the newest plan as text, if there are too few; otherwise "".
         controller: exports that were active on the controller, with the times.
         has_several_arms: whether `cell.yaml` lists several arms, for which no steps are kept.
     """
@@ -79,7 +79,7 @@ class CellFacts:
     no_plan_reason: str = ""
     settings_sha256: str = ""
     changed_models: tuple[str, ...] = ()
-    measured_pose_text: str = ""
+    too_few_poses_text: str = ""
     controller: ControllerHistory = field(default_factory=ControllerHistory)
     has_several_arms: bool = False
 
@@ -112,7 +112,7 @@ class CellFacts:
         changes: list[tuple[str, str, str]] = [
             (one.day, one.recorded, one.kind) for one in self.events if one.kind in CHANGING_EVENTS
         ]
-        changes += [(one.day, one.recorded, "controller") for one in self.controller.zero_changes]
+        changes += [(one.day, one.recorded, "controller") for one in self.controller.joint_zero_changes]
         late = [(kind, day) for day, at, kind in changes if at > model.made and first < day <= model.day]
         return f"the event '{late[-1][0]}' of {late[-1][1]}" if late else ""
 
@@ -226,7 +226,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
         changed_models=tuple(
             name for name, sha256 in checked.items() if not is_unchanged(folder / MODELS / name, sha256)
         ),
-        measured_pose_text=_incomplete(folder, sessions, checks),
+        too_few_poses_text=_incomplete(folder, sessions, checks),
         controller=ControllerHistory.from_history(history),
         has_several_arms=is_cell_of_arms(folder),
     )

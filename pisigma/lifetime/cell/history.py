@@ -248,7 +248,7 @@ class History:
         """Return all monitored sessions of all models in the order in which they were added."""
         return self.database.read(MonitoredSession)
 
-    def uses(self) -> tuple[InUse, ...]:
+    def model_in_use_changes(self) -> tuple[InUse, ...]:
         """Return the changes of the model in use; the last one names the current model."""
         return self.database.read(InUse)
 
@@ -264,7 +264,7 @@ class History:
     def model_after_undo(self) -> str | None:
         """Name of the model that an undo would put into use, "" for no model; None if there is nothing to undo."""
         states = [""]
-        for one in self.uses():
+        for one in self.model_in_use_changes():
             if one.undo:
                 states.pop()
             elif one.model != states[-1]:
@@ -274,7 +274,7 @@ class History:
     @property
     def in_use(self) -> ModelEntry | None:
         """The model in use; None if there is none."""
-        uses = self.uses()
+        uses = self.model_in_use_changes()
         return self.model(uses[-1].model) if uses and uses[-1].model else None
 
     def model(self, name: str) -> ModelEntry:

@@ -58,7 +58,7 @@ def previous_and_current_model(path: str | os.PathLike[str]) -> tuple[Path, Path
     Raises:
         ModelError: fewer than two models have been in use.
     """
-    used = [one.model for one in History(Path(path) / HISTORY).uses() if one.model]
+    used = [one.model for one in History(Path(path) / HISTORY).model_in_use_changes() if one.model]
     earlier = [name for name in used if name != used[-1]]
     if not earlier:
         raise ModelError(

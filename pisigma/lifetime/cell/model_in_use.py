@@ -52,7 +52,7 @@ class ModelInUse:
         self.findings.checked_warnings(cell)
         load(self.folder)
 
-    def check(self, retry_failed: bool = False) -> None:
+    def load_if_changed(self, retry_failed: bool = False) -> None:
         """Load the model in use if it has changed.
 
         Args:
@@ -123,7 +123,7 @@ def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) 
         model = followed()
         if model is None or not model._is_followed:
             return
-        model.check()
+        model.load_if_changed()
         for sentence in model.warnings:
             if sentence not in reported:
                 with suppress(OSError, ValueError):  # the reports are no longer read

@@ -46,9 +46,9 @@ class CellStatus:
         return Path(self.facts.folder).name
 
     @property
-    def is_due(self) -> bool:
+    def has_automatic_step(self) -> bool:
         """Whether there are steps that need neither new rows nor a decision by a person."""
-        return self.step.verb is not None or self.step.state in ("not_taken_in", "file_refused")
+        return self.step.automatic_command is not None or self.step.state in ("not_taken_in", "file_refused")
 
     @property
     def last_error(self) -> Check | None:
@@ -103,8 +103,8 @@ def status_of(folder: Path) -> CellStatus:
 def next_step(facts: CellFacts) -> Step:
     """Return the step of the first of `RULES` and `RULES_IN_USE` that applies; an open plan is measured first."""
     step = due_step(facts)
-    if facts.measured_pose_text and step.verb in ("calibrate", "verify", "monitor"):
-        why = f"{facts.measured_pose_text}; measure and import the others, or continue with `{step.command}`"
+    if facts.too_few_poses_text and step.automatic_command in ("calibrate", "verify", "monitor"):
+        why = f"{facts.too_few_poses_text}; measure and import the others, or continue with `{step.command}`"
         return Step("session_incomplete", why, facts.import_command())
     if step.command != facts.command("plan"):
         return step
@@ -273,10 +273,10 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
 
 def _other_joint_zeros(facts: CellFacts, model: ModelEntry) -> Step | None:
     state: State = "other_joint_zeros"
-    if facts.controller.fits(model, facts.sessions):
+    if (matches := facts.controller.matches_model)(model, facts.sessions):
         return None
     why = f"model '{model.name}' needs joint zeros other than those that are active on the controller"
-    if fitting := [one.name for one in facts.unchanged_models if facts.controller.fits(one, facts.sessions)]:
+    if fitting := [one.name for one in facts.unchanged_models if matches(one, facts.sessions)]:
         return Step(state, f"{why}; model '{fitting[-1]}' needs these", facts.command("use", fitting[-1]))
     if not (new := facts.new_sessions(model)):
         return Step(state, why, facts.command("plan"))

@@ -70,7 +70,7 @@ class Step:
         object.__setattr__(self, "reason", self.reason.rstrip("."))
 
     @property
-    def verb(self) -> str | None:
+    def automatic_command(self) -> str | None:
         """Name of the command if it needs neither rows nor a decision by a person; otherwise None."""
         words = self.command.split()[1:2]
         return words[0] if words and words[0] in COMPUTED else None

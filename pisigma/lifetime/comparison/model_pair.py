@@ -38,16 +38,18 @@ class ModelPair:
         second: model that is compared with it.
         frames: how bases and tools are aligned.
         frame_names: names of the frame and the target in which each model is compared.
-        T_base: transform from the frame of the second model to that of the first; the identity for fixed frames.
-        T_tool: pose of the first model's tool in the tool frame of the second; the identity for fixed frames.
+        T_first_second: transform from the frame of the second model to that of the first; the identity for fixed
+            frames.
+        T_second_tool_first_tool: pose of the first model's tool in the tool frame of the second; the identity for
+            fixed frames.
     """
 
     first: CalibratedModel
     second: CalibratedModel
     frames: FrameChoice
     frame_names: tuple[tuple[str, str], tuple[str, str]]
-    T_base: Float64[Tensor, "4 4"]
-    T_tool: Float64[Tensor, "4 4"]
+    T_first_second: Float64[Tensor, "4 4"]
+    T_second_tool_first_tool: Float64[Tensor, "4 4"]
 
     @staticmethod
     def from_models(first: CalibratedModel, second: CalibratedModel, frames: FrameChoice) -> "ModelPair":
@@ -66,7 +68,7 @@ class ModelPair:
         frame_names = _frame_names(first, second, frames)
         eye = torch.eye(4, dtype=torch.float64)
         pair = ModelPair(first, second, frames, frame_names, eye, eye)
-        T_first, T_second = pair.poses(pair.workspace[:: _SAMPLES // _FITTED_SAMPLES])
+        T_first, T_second = pair.poses(pair.workspace_joints[:: _SAMPLES // _FITTED_SAMPLES])
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
             raise ModelError(
@@ -90,7 +92,7 @@ class ModelPair:
         return torch.cat(sampled)
 
     @property
-    def workspace(self) -> Float64[Tensor, "samples dof"]:
+    def workspace_joints(self) -> Float64[Tensor, "samples dof"]:
         """Joint values that the models store, and random joint values within their common ranges [rad or m]."""
         kept = torch.unique(torch.cat([self.first.starts, self.second.starts]), dim=0)
         ranges = [(model.starts.amin(0), model.starts.amax(0)) for model in (self.first, self.second)]
@@ -113,7 +115,7 @@ class ModelPair:
             poses_of_rows(model, Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q)))
             for model, (frame, target) in zip((self.first, self.second), self.frame_names, strict=True)
         )
-        return first, self.T_base @ second @ self.T_tool
+        return first, self.T_first_second @ second @ self.T_second_tool_first_tool
 
     @torch.no_grad()
     def displacement(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6"]:
@@ -127,7 +129,7 @@ class ModelPair:
     def frames_of_second(self) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
         """Return base and tool of the second model, aligned with those of the first."""
         base, tool = frames_of(self.second, self.frame_names[1])
-        return self.T_base @ base, tool @ self.T_tool
+        return self.T_first_second @ base, tool @ self.T_second_tool_first_tool
 
 
 def frames_of(

@@ -68,7 +68,7 @@ class RemeasuredArm:
             base, in the coordinates of the previous base of the first arm; and their derivatives along the directions
             of the root of the model, followed by those of the current noise.
         """
-        before = self.posterior.values[list(self.posterior.base_rows(frame))]
+        before = self.posterior.values[list(self.posterior.base_indices(frame))]
         now = torch.from_numpy(self.current_frames.fit.solved.geometry.bases[frame].copy())
         T_first_frame = self.T_first_base @ invert(transform_from_xyz_zyx(before))
 
@@ -79,8 +79,8 @@ class RemeasuredArm:
 
         both = torch.stack([now, before])
         J = torch.func.jacrev(motion)(both)
-        arm = J[:, 0] @ self.current_frames.arm_root[self._rows(frame)]
-        arm = arm + J[:, 1] @ self.posterior.covariance_root[list(self.posterior.base_rows(frame))]
+        arm = J[:, 0] @ self.current_frames.arm_covariance_root[self._rows(frame)]
+        arm = arm + J[:, 1] @ self.posterior.covariance_root[list(self.posterior.base_indices(frame))]
         noise = J[:, 0] @ self._noise(frame)
         return motion(both), torch.cat([arm, noise], 1)
 
@@ -111,14 +111,14 @@ class MovedBases:
     """Bodies that moved between the calibration of arms and new rows.
 
     Attributes:
-        probability: probability of differences this large if nothing moved.
+        p_value: probability of differences this large if nothing moved.
         bodies: arms, frames and joints, best explanation first, each as if only it had moved.
         is_one_body: whether the motion of the first body explains the differences; otherwise more than one body moved.
         explaining_joint: the joint whose zero alone explains the differences as well as the motion of a body; None if
             there is none.
     """
 
-    probability: float
+    p_value: float
     bodies: tuple[MovedBody, ...]
     is_one_body: bool
     explaining_joint: MovedBody | None = None
@@ -126,7 +126,7 @@ class MovedBases:
     @cached_property
     def likely_bodies(self) -> tuple[MovedBody, ...]:
         """The body whose motion explains the differences best; several if these cannot be distinguished, or none."""
-        if self.probability >= _FALSE_ALARMS:
+        if self.p_value >= _FALSE_ALARMS:
             return ()
         if self.explaining_joint is not None:
             return (self.explaining_joint,)
@@ -172,7 +172,10 @@ def find_moved_bases(arms: Sequence[RemeasuredArm]) -> MovedBases:
     square = float(white.square().sum())
     probability = float(fisher.sf(square / len(y), len(y), freedom))
     torso = {
-        name: arm.posterior.torso[0] for arm in arms for name in (arm.posterior.name,) if arm.posterior.torso
+        name: arm.posterior.torso_joints[0]
+        for arm in arms
+        for name in (arm.posterior.name,)
+        if arm.posterior.torso_joints
     }
     first = {joint: name for name, joint in reversed(torso.items())}
     bodies = [
@@ -217,18 +220,25 @@ def _if_moved(
     """Return the motion of a body if only this body moved; the arms see the opposite motion of a frame."""
     kind, name = body
     moving = [arms[number].posterior for number, _ in owners]
-    same = next((arm.torso[0] for arm in moving if arm.torso and name in (arm.name, arm.torso[0])), "")
+    same = next(
+        (
+            arm.torso_joints[0]
+            for arm in moving
+            if arm.torso_joints and name in (arm.name, arm.torso_joints[0])
+        ),
+        "",
+    )
     signs = [
         (-1.0 if frame == name else 0.0)
         if kind == "frame"
-        else float(arm.name == name or same in arm.torso[:1])
+        else float(arm.name == name or same in arm.torso_joints[:1])
         for arm, (_, frame) in zip(moving, owners, strict=True)
     ]
     eye = torch.eye(6, dtype=torch.float64)
     origin = _origin(arms, owners, body)
     along = eye
     if kind == "joint":
-        axis = next(arm.T_first_base[:3, 2] for arm in arms if name in arm.posterior.torso)
+        axis = next(arm.T_first_base[:3, 2] for arm in arms if name in arm.posterior.torso_joints)
         along = torch.cat([torch.linalg.cross(origin, axis), axis])[:, None]
     G = torch.linalg.solve_triangular(L, torch.cat([sign * along for sign in signs]), upper=False)
     Q, R = torch.linalg.qr(G)
@@ -252,8 +262,8 @@ def _origin(
     """Return the origin of an arm's base or of a frame in the base of the first arm [m]."""
     kind, name = body
     if kind != "frame":
-        arm = next(arm for arm in arms if name in (arm.posterior.name, *arm.posterior.torso))
+        arm = next(arm for arm in arms if name in (arm.posterior.name, *arm.posterior.torso_joints))
         return arm.T_first_base[:3, 3]
     arm = next(arms[number] for number, frame in owners if frame == name)
-    before = arm.posterior.values[list(arm.posterior.base_rows(name))]
+    before = arm.posterior.values[list(arm.posterior.base_indices(name))]
     return (arm.T_first_base @ invert(transform_from_xyz_zyx(before)))[:3, 3]

@@ -51,7 +51,7 @@ class JointDifference:
 
     Attributes:
         joint: name of the joint.
-        value: follower minus leader [rad], in (-pi, pi].
+        follower_minus_leader: follower minus leader [rad], in (-pi, pi].
         standard_error: standard error of the difference [rad].
         verdict: "different" if the difference is significant and larger than the tolerance, "same" if it is smaller
             than the tolerance with a confidence of 97.5 %, otherwise "unknown", which more rows would decide.
@@ -60,7 +60,7 @@ class JointDifference:
     """
 
     joint: str
-    value: float
+    follower_minus_leader: float
     standard_error: float
     verdict: Verdict
     moved_arm: Moved | None

@@ -78,15 +78,16 @@ class ParameterDifferences:
 
     Attributes:
         parameters: all DH parameters of the arm.
-        differing: significant differences, estimated together; a joint zero counts in the direction of the joint.
-        frames: distances and angles by which base and tool of the second model differ, for fitted frames only.
+        significant_differences: significant differences, estimated together; a joint zero counts in the direction of
+            the joint.
+        frame_movements: distances and angles by which base and tool of the second model differ, for fitted frames only.
         remainder: test of the remaining displacement; None without posteriors.
         significance_level: family-wise significance level.
     """
 
     parameters: tuple[ParameterDifference, ...]
-    differing: tuple[Difference, ...]
-    frames: tuple[Movement, ...]
+    significant_differences: tuple[Difference, ...]
+    frame_movements: tuple[Movement, ...]
     remainder: Remainder | None
     significance_level: float
 
@@ -113,7 +114,7 @@ def parameter_differences(pair: ModelPair, significance_level: float = _LEVEL) -
     chosen: list[int] = []
     while float((scores := effects.standard_scores(chosen)).abs().amax()) > threshold:
         chosen.append(int(scores.abs().argmax()))
-    p = effects.unexplained_probability(chosen)
+    p = effects.remainder_p_value(chosen)
     tested = (_tested(effects, number, one, chosen, parameters) for number, one in enumerate(parameters))
     return ParameterDifferences(
         tuple(tested),

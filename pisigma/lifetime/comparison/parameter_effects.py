@@ -55,7 +55,7 @@ class Difference:
             if self.equivalent_parameters
             else ""
         )
-        return f"{self.shift.what}{alike} by {self.shift.size}"
+        return f"{self.shift.what}{alike} by {self.shift.shift_text}"
 
     def to_json(self) -> dict[str, object]:
         """Return plain values; see `Movement.to_json`."""
@@ -146,7 +146,7 @@ class ParameterEffects:
         scores[~(tested & observable)] = 0.0
         return scores
 
-    def unexplained_probability(self, explained_parameters: Sequence[int]) -> float:
+    def remainder_p_value(self, explained_parameters: Sequence[int]) -> float:
         """Compute the probability that the displacement not explained by the given parameters is due to chance.
 
         The sum of squares is compared with that of normal values with the covariance of the posteriors, by
@@ -209,7 +209,7 @@ class ParameterEffects:
     ) -> tuple[Movement, ...]:
         """Return the differences of base and tool of both models: the fitted motion plus the linear estimate."""
         pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.frame_names[0])
-        X, Y, origin = pair.T_base, pair.T_tool, base[:3, 3]
+        X, Y, origin = pair.T_first_second, pair.T_second_tool_first_tool, base[:3, 3]
         moved = []
         # X base_2 = exp(step) base_1 and tool_2 Y = tool_1 exp(step)
         for what, step, C, R, was, now in (

@@ -193,7 +193,10 @@ def _correction(
 
 
 def evidence_of(
-    model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements, class_share: float = 0.0
+    model: CalibratedModel,
+    mean: Float64[Tensor, " unknowns"],
+    rows: Measurements,
+    class_covariance_factor: float = 0.0,
 ) -> RobotEvidence:
     """Compute the information of a robot's rows, linearised at its most probable errors.
 
@@ -201,10 +204,10 @@ def evidence_of(
         model: mean robot of a fleet.
         mean: mean of the unknowns [m or rad].
         rows: rows of the robot.
-        class_share: multiple of the covariance of the robot's class by which the prior is widened while the most
-            probable errors, the noise and the wrong rows are found.
+        class_covariance_factor: multiple of the covariance of the robot's class by which the prior is widened while
+            the most probable errors, the noise and the wrong rows are found.
     """
-    posterior = _widened(ModelPosterior.from_model(model), class_share)
+    posterior = _widened(ModelPosterior.from_model(model), class_covariance_factor)
     rows = posterior.with_model_names(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
@@ -225,12 +228,12 @@ def evidence_of(
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 
 
-def _widened(prior: ModelPosterior, class_share: float) -> ModelPosterior:
+def _widened(prior: ModelPosterior, class_covariance_factor: float) -> ModelPosterior:
     """Return the prior with a multiple of the covariance of the robot's class added."""
-    if not class_share:
+    if not class_covariance_factor:
         return prior
     space, usual = prior.space, robot_class_population(prior.space.robot)
-    deviation = (class_share * usual.covariance.diagonal()).sqrt().diag()
+    deviation = (class_covariance_factor * usual.covariance.diagonal()).sqrt().diag()
     between = prior.covariance_root.new_zeros(
         (len(space.parameters) - space.arm_parameter_count, len(deviation))
     )
@@ -258,15 +261,15 @@ class FleetConsistency:
     """Consistency of a robot with the other robots of its fleet.
 
     Attributes:
-        probability: probability that a robot of the fleet is at least as far from its mean.
+        p_value: probability that a robot of the fleet is at least as far from its mean.
         log_evidence_gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
-        class_share: multiple of the covariance of its class which, added to that of the fleet, makes its rows most
-            probable; a robot unlike the others would otherwise get the small predicted errors of the fleet.
+        class_covariance_factor: multiple of the covariance of its class which, added to that of the fleet, makes its
+            rows most probable; a robot unlike the others would otherwise get the small predicted errors of the fleet.
     """
 
-    probability: float
+    p_value: float
     log_evidence_gain: float
-    class_share: float
+    class_covariance_factor: float
 
     @staticmethod
     def from_rows(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
@@ -285,7 +288,7 @@ class FleetConsistency:
         errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])
         # Rows that a robot of the fleet cannot have may be right for a robot unlike it.
-        evidence = evidence_of(model, mean, rows, class_share=_CLASS_SHARES[-1])
+        evidence = evidence_of(model, mean, rows, class_covariance_factor=_CLASS_SHARES[-1])
         fleet = Population(mean, root @ root.t(), posterior.space.arm_parameter_count)
         square, count = fleet.squared_distance(evidence)
         usual = robot_class_population(nominal)
@@ -299,12 +302,12 @@ class FleetConsistency:
 
     def widened(self, prior: ModelPosterior) -> ModelPosterior:
         """Return the prior with this multiple of the covariance of the robot's class added."""
-        return _widened(prior, self.class_share)
+        return _widened(prior, self.class_covariance_factor)
 
     @property
     def is_inconsistent(self) -> bool:
         """Whether the robot is inconsistent with the fleet, and the robot's class explains the rows better."""
-        return self.probability < FALSE_ALARM and self.log_evidence_gain < 0
+        return self.p_value < FALSE_ALARM and self.log_evidence_gain < 0
 
     @property
     def sentence(self) -> str:
@@ -315,5 +318,5 @@ class FleetConsistency:
                 "fleet are this far from the mean, and the usual errors of the robot's class explain the rows better. "
                 "The fleet prior is not used if the rows suffice for a calibration without it."
             )
-        share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
+        share = f"{100 * self.p_value:.0f} %" if self.p_value >= 0.01 else "fewer than 1 %"
         return f"This robot is consistent with the fleet: {share} of its robots are at least this far from the mean."

@@ -29,15 +29,15 @@ class ParameterErrorFigures(StoredFigures):
         unit: "mm" or "deg".
         mean: mean error.
         sigma: standard deviation between robots.
-        in_a_sum: whether other parameters, base or tool move the tool of the nominal robot in the same way, so that
-            mean and deviation are determined only together with theirs.
+        is_determined_only_in_sum: whether other parameters, base or tool move the tool of the nominal
+            robot in the same way, so that mean and deviation are determined only together with theirs.
     """
 
     name: str
     unit: str
     mean: float
     sigma: Annotated[float, Field(alias="deviation")]
-    in_a_sum: bool = False
+    is_determined_only_in_sum: Annotated[bool, Field(alias="in_a_sum")] = False
 
 
 class WeightSpreadFigures(StoredFigures):
@@ -103,7 +103,9 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
         dependent = bool(in_a_sum[number])
         parameters.append(
-            ParameterErrorFigures(name=name, unit=unit, mean=mean, sigma=spread, in_a_sum=dependent)
+            ParameterErrorFigures(
+                name=name, unit=unit, mean=mean, sigma=spread, is_determined_only_in_sum=dependent
+            )
         )
     weights, start, spectrum = deviation[population.geometric_count :], 0, []
     for feature in uncertainty.features:

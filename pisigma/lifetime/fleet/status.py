@@ -64,7 +64,9 @@ class FleetStatus:
     @property
     def needs_action(self) -> bool:
         """Whether a cell needs attention, has steps that `pisigma fleet run` carries out, or cannot be read."""
-        return bool(self.unreadable) or any(one.step.state in ATTENTION or one.is_due for one in self.cells)
+        return bool(self.unreadable) or any(
+            one.step.state in ATTENTION or one.has_automatic_step for one in self.cells
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as plain values."""
@@ -85,4 +87,4 @@ def urgency(status: CellStatus) -> tuple[int, str]:
     state = status.step.state
     if state in ATTENTION:
         return ATTENTION.index(state), state
-    return len(ATTENTION) + (0 if status.is_due else 2 if state == "up_to_date" else 1), state
+    return len(ATTENTION) + (0 if status.has_automatic_step else 2 if state == "up_to_date" else 1), state

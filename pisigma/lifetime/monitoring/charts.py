@@ -84,19 +84,19 @@ class Chart:
         return torch.tensor(sums, dtype=torch.float64).reshape(-1, 2)
 
     @property
-    def ewma_of_limit(self) -> Float64[Tensor, " sessions"]:
+    def ewma_to_limit_ratio(self) -> Float64[Tensor, " sessions"]:
         """Ratio of the moving average to its limit; a value above 1 is an alarm."""
         return (self.ewma if self.one_sided else self.ewma.abs()) / self.limits.ewma
 
     @property
-    def cusum_of_limit(self) -> Float64[Tensor, " sessions"]:
+    def cusum_to_limit_ratio(self) -> Float64[Tensor, " sessions"]:
         """Ratio of the larger cumulative sum to its limit; a value above 1 is an alarm."""
         return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
 
     @cached_property
     def sessions_outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
         """Sessions at which each statistic is outside its limit."""
-        return {"EWMA": self.ewma_of_limit > 1, "CUSUM": self.cusum_of_limit > 1}
+        return {"EWMA": self.ewma_to_limit_ratio > 1, "CUSUM": self.cusum_to_limit_ratio > 1}
 
     @property
     def alarm(self) -> int | None:
@@ -120,8 +120,8 @@ class Chart:
             f"values_{self.unit}": self.values,
             f"deviations_{self.unit}": self.sigmas,
             "scores": self.scores,
-            "ewma_of_limit": self.ewma_of_limit,
-            "cusum_of_limit": self.cusum_of_limit,
+            "ewma_of_limit": self.ewma_to_limit_ratio,
+            "cusum_of_limit": self.cusum_to_limit_ratio,
         }
         numbers = {
             name: [None if math.isnan(one) else one for one in those.tolist()]

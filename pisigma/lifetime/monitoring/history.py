@@ -69,11 +69,13 @@ class Record:
             "unchanged_probability": session.unchanged_probability,
             "moved": [one.to_json() for one in session.movements],
             "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
-            "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
-            "remarks": list(session.unobservable),
+            "unobservable": [
+                f"joint {k}" for k, seen in enumerate(session.zero_is_observable, 1) if not seen
+            ],
+            "remarks": list(session.unobservable_sentences),
             "outliers": list(session.outliers),
             "rms_mm": session.rms * 1e3,
-            "expected_gain_mm": session.gain * 1e3,
+            "expected_gain_mm": session.expected_gain * 1e3,
             "recalibrate": session.recalibrate,
         }
 
@@ -128,7 +130,7 @@ def _entry(model: str, record: Record) -> MonitoredSession:
         verdict=session.verdict,
         unchanged=session.unchanged_probability,
         rms_mm=session.rms * 1e3,
-        rms_after_mm=session.rms_after * 1e3,
+        rms_after_mm=session.rms_after_recalibration * 1e3,
         session=_SESSION.dump_json(session, by_alias=True).decode(),
         arrays=_packed(record.zeros, record.values),
     )

@@ -81,13 +81,13 @@ class SessionResult:
         movements: movements; movements of the arm come first.
         candidates: names and probabilities of possible movements if these are ambiguous; otherwise empty.
         rms: RMS position error under the model, with the current base and tool [m].
-        rms_after: RMS position error expected after a recalibration [m].
+        rms_after_recalibration: RMS position error expected after a recalibration [m].
         rotation_ratio: ratio of orientation errors to the errors expected after a recalibration; 1 if none was
             measured.
         error_score: RMS of the errors divided by their standard deviations; about 1 if nothing changed.
         values: number of measured values.
         relocated_frames: names of bases and tools that have been moved since the model was made.
-        observable: whether the rows determine the zero of each joint.
+        zero_is_observable: whether the rows determine the zero of each joint.
         outliers: file and line of rows that are not used because they contradict the other rows under any movement.
         score_ratio: for images, whose poses have more noise than error, RMS ratio of values to their standard
             deviations, divided by that expected after a recalibration; otherwise 1.
@@ -98,12 +98,12 @@ class SessionResult:
     movements: Annotated[tuple[HistoryMovement, ...], Field(alias="moved")]
     candidates: tuple[tuple[str, float], ...]
     rms: float
-    rms_after: float
+    rms_after_recalibration: Annotated[float, Field(alias="rms_after")]
     rotation_ratio: float
     error_score: float
     values: int
     relocated_frames: Annotated[tuple[str, ...], Field(alias="standing")]
-    observable: tuple[bool, ...]
+    zero_is_observable: Annotated[tuple[bool, ...], Field(alias="observable")]
     outliers: tuple[str, ...] = ()
     score_ratio: float = 1.0
 
@@ -119,7 +119,7 @@ class SessionResult:
         """Whether the arm has changed so much that a recalibration is recommended."""
         arm = any(not is_frame(one.what) for one in self.movements) or bool(self.candidates)
         return arm and (
-            self.rms > _MIN_GAIN_RATIO * self.rms_after
+            self.rms > _MIN_GAIN_RATIO * self.rms_after_recalibration
             or max(self.rotation_ratio, self.score_ratio) > _MIN_GAIN_RATIO
         )
 
@@ -143,10 +143,10 @@ class SessionResult:
         return f"{'; '.join(moved)}."
 
     @property
-    def unobservable(self) -> tuple[str, ...]:
+    def unobservable_sentences(self) -> tuple[str, ...]:
         """Sentences about the joints whose zeros the rows do not determine, and why."""
-        last, sentences = len(self.observable), []
-        for number, observable in enumerate(self.observable, 1):
+        last, sentences = len(self.zero_is_observable), []
+        for number, observable in enumerate(self.zero_is_observable, 1):
             frame = {1: "base", last: "tool"}.get(number, "")
             if not observable and frame and any(name.split()[0] == frame for name in self.relocated_frames):
                 sentences.append(
@@ -158,9 +158,9 @@ class SessionResult:
         return tuple(sentences)
 
     @property
-    def gain(self) -> float:
+    def expected_gain(self) -> float:
         """Expected decrease of the RMS error of such rows due to a recalibration [m]."""
-        return max(self.rms - self.rms_after, 0.0)
+        return max(self.rms - self.rms_after_recalibration, 0.0)
 
 
 def judge_session(
@@ -288,7 +288,7 @@ def _explained(
     every = SessionEvidence(values, problem.covariance_root, standing, movement_hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[_Solved]:
-        evidence = every.with_wrong_rows(wrong)
+        evidence = every.with_wrong_configurations(wrong)
         there, explanation = evidence.values, evidence.compare_hypotheses()
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
@@ -299,12 +299,12 @@ def _explained(
 
 
 def _sized(motion: GroupMotion) -> DriftGroup:
-    return replace(motion.group, size=motion.size)
+    return replace(motion.group, drift_size=motion.size)
 
 
 def _freed(motion: GroupMotion) -> DriftGroup:
     """Return the group of a movement, with a prior of at least `ZERO_PRIOR`."""
-    return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
+    return replace(motion.group, drift_size=max(motion.size, ZERO_PRIOR))
 
 
 def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> SessionResult:
@@ -328,15 +328,15 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> SessionResult:
         movements=_moved(solved, relocated),
         candidates=tuple((one.group.name, one.probability) for one in explanation.candidates),
         rms=rms,
-        rms_after=rms_after * optimism,
+        rms_after_recalibration=rms_after * optimism,
         rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
         score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
         error_score=evidence.with_moved_groups(solved.moved_frames).error_score(),
         values=len(solved.values.y),
         relocated_frames=tuple(" ".join(owner).strip() for owner in relocated),
-        observable=tuple(
+        zero_is_observable=tuple(
             float(evidence.estimate_shift([group], explanation.noise_factor)[1].sqrt())
-            < _UNOBSERVABLE * float(group.scale)
+            < _UNOBSERVABLE * float(group.sigma_at_unit_size)
             for group in _joints(solved)
         ),
         outliers=tuple(every.place(row) for row in wrong.nonzero()[:, 0].tolist()),
@@ -378,7 +378,7 @@ def _zeros(solved: _Solved) -> JointZeros:
 def _joints(solved: _Solved) -> list[DriftGroup]:
     """Return the groups of all joint zeros, with their prior set to `ZERO_PRIOR`."""
     groups = solved.problem.groups
-    return [replace(group, size=ZERO_PRIOR) for group in groups if group.name.startswith("joint ")]
+    return [replace(group, drift_size=ZERO_PRIOR) for group in groups if group.name.startswith("joint ")]
 
 
 def format_probability(probability: float | None) -> str:

@@ -318,7 +318,10 @@ def _joint_values(records: Sequence[Record], joint: int, direction: int) -> tupl
 
     The shifts are correlated, because all sessions share the uncertainty of the model.
     """
-    values = [float(one.zeros.shift[joint]) if one.session.observable[joint] else math.nan for one in records]
+    values = [
+        float(one.zeros.shift[joint]) if one.session.zero_is_observable[joint] else math.nan
+        for one in records
+    ]
     sensitivity = torch.stack([one.zeros.model_sensitivity[joint] for one in records])
     variance = torch.stack([one.zeros.session_covariance[joint, joint] for one in records])
     return direction * torch.tensor(

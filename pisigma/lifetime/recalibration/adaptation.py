@@ -200,8 +200,10 @@ def linear_values(problem: RecalibrationProblem, rows: LinearisedRows) -> Linear
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
     """Return the groups with the sizes of groups that have the same names."""
-    sizes = {one.name: one.size for one in like}
-    return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.name, 0.0)) for one in groups)
+    sizes = {one.name: one.drift_size for one in like}
+    return tuple(
+        one if one.fixed_size else replace(one, drift_size=sizes.get(one.name, 0.0)) for one in groups
+    )
 
 
 def _searched(

@@ -65,14 +65,14 @@ class CandidateChoice:
     Attributes:
         kept: "recalibrated", unless another candidate is better by more than 5 %, and significantly.
         rms: RMS error of held-out rows under each candidate [m]; None if there are too few rows for the candidate.
-        rows: number of held-out rows that were used.
+        held_out_row_count: number of held-out rows that were used.
         p95: 95 % quantile of the same errors [m].
         names: names of the candidates, as at the start of a sentence.
     """
 
     kept: Kept
     rms: Mapping[Kept, float | None]
-    rows: int
+    held_out_row_count: int
     p95: Mapping[Kept, float | None] = field(default_factory=dict)
     names: Mapping[Kept, str] = field(default_factory=lambda: NAMES)
 
@@ -91,7 +91,7 @@ class CandidateChoice:
     @property
     def sentence(self) -> str:
         """Return a sentence about the chosen candidate, with the errors of all candidates."""
-        if not self.rows:
+        if not self.held_out_row_count:
             return f"{self.names[self.kept]} is kept: there are too few rows for a cross-validation."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
         if self.kept not in sizes:
@@ -102,8 +102,8 @@ class CandidateChoice:
             if name != self.kept
         )
         return (
-            f"{self.names[self.kept]} is kept: the RMS error of {self.rows} rows held out in cross-validation is "
-            f"{sizes[self.kept]:.3g} mm{f', compared with {others}' if others else ''}."
+            f"{self.names[self.kept]} is kept: the RMS error of {self.held_out_row_count} rows held out in "
+            f"cross-validation is {sizes[self.kept]:.3g} mm{f', compared with {others}' if others else ''}."
         )
 
 

@@ -74,7 +74,7 @@ def session_diagnostics(
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
         return (too_many_wrong_rows_diagnostic(rows, torch.tensor(wrong)),)
     limit = plausible_error_per_reach(model.robot) * model.robot.reach
-    if session.rms_after > limit:
+    if session.rms_after_recalibration > limit:
         sentence = (
             f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement reduces it to less than "
             f"{limit * 1e3:.3g} mm: a robot other than that of model '{model.name}' was measured, or a column or unit "
@@ -87,7 +87,7 @@ def session_diagnostics(
 def motion_sentence(motion: SessionResult, comparison: ModelComparison) -> str:
     """Return a sentence about movements of the arm, their probability, and the gain expected of a recalibration."""
     means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
-    errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
+    errors = (length_text(rms) for rms in (motion.rms, motion.rms_after_recalibration))
     return (
         f"{motion_text(motion)}, and the mean error is {next(means)} ({next(means)} under the nominal robot). "
         f"Recalibrating is expected to lower the RMS error from {next(errors)} to {next(errors)}."
@@ -109,7 +109,7 @@ def motion_text(motion: SessionResult) -> str:
     """Return a text about movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
     amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.movements:
-        amounts.setdefault((one.what, one.probability), []).append(one.size)
+        amounts.setdefault((one.what, one.probability), []).append(one.shift_text)
     text = join_words(
         f"{_subject(what)} by {join_words(those)} (probability {format_probability(probability)})"
         for (what, probability), those in amounts.items()
@@ -137,7 +137,7 @@ def excessive_change_diagnostics(robot: Robot, movements: Sequence[Movement]) ->
     far = [one for one in movements if not is_frame(one.what) and _is_beyond(one, of_class.max_changes)]
     if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
         return ()
-    changes = join_words(f"{one.what} by {one.size}" for one in far)
+    changes = join_words(f"{one.what} by {one.shift_text}" for one in far)
     return (
         Diagnostic(
             kind="beyond_wear",

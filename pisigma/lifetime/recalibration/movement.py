@@ -65,7 +65,7 @@ class Movement:
         return abs(self.shift) > (_CLEAR_DISTANCE if is_frame(self.what) else CLEAR) * self.sigma
 
     @property
-    def size(self) -> str:
+    def shift_text(self) -> str:
         """Shift, half-width of its 95 % interval and unit, such as "0.25 ± 0.01 deg"."""
         half = self.half_width
         digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
@@ -75,7 +75,7 @@ class Movement:
     @property
     def sentence(self) -> str:
         """Clause, such as "joint 3 moved by 0.25 ± 0.01 deg"."""
-        return f"{self.what} moved by {self.size}"
+        return f"{self.what} moved by {self.shift_text}"
 
     def to_json(self) -> dict[str, object]:
         """Return plain values; the key of the shift ends with the unit: `shift_mm` or `shift_deg`."""
@@ -118,7 +118,7 @@ def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
     """
     moved: list[Movement] = []
     for number, group in enumerate(adaptation.drift.groups):
-        if group.size and group.name.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
+        if group.drift_size and group.name.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
             estimate = adaptation.search.estimate_shift(number, with_prior=not group.name.startswith("joint"))
             moved += movements_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
     return tuple(one for one in moved if one.is_significant)

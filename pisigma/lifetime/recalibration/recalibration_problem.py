@@ -329,7 +329,7 @@ def movement_hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]
         if group.name not in ("lengths", "angles"):
             single.append(replace(group, log_prior_penalty=_MOVEMENT_PENALTY))
             continue
-        for index, scale in zip(group.index, group.scale, strict=True):
+        for index, scale in zip(group.index, group.sigma_at_unit_size, strict=True):
             penalty = _MOVEMENT_PENALTY + math.log(10 * len(group.index))
             single.append(
                 DriftGroup(parameters[int(index)].name, index[None], scale[None], log_prior_penalty=penalty)

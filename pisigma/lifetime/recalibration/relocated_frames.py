@@ -46,7 +46,9 @@ def relocated_frames(
         return adapt(problem).drift.log_evidence - LOG_PRIOR_PENALTY * len(relocated)
 
     unmoved = adapt(recalibration_problem(model, posterior, rows, frozenset())).drift
-    if all(group.size < MIN_MOVE for group in unmoved.groups if group.name.startswith(("base", "tool"))):
+    if all(
+        group.drift_size < MIN_MOVE for group in unmoved.groups if group.name.startswith(("base", "tool"))
+    ):
         return frozenset()
     tried = {frozenset[FrameKey](): unmoved.log_evidence}
     for owners in filter(None, (bases, tools, bases | tools)):

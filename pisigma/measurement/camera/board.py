@@ -159,7 +159,7 @@ class Board:
         return np.concatenate([along, across])
 
     @property
-    def clearance(self) -> float:
+    def relative_edge_clearance(self) -> float:
         """Width of the uniformly black or white areas on both sides of an edge, relative to the edge's length."""
         if self.kind == "apriltag":
             return 1.0 / _TAG_CELLS[self.dictionary]

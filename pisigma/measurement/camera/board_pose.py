@@ -36,8 +36,8 @@ class BoardPose:
         intrinsics_jacobian: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame
             [rad]) with respect to the intrinsics.
         information_root: square root of the corners' information on the intrinsics k, with the pose eliminated and a
-            noise of 1 px: `root (k - k0) = residual` with the intrinsics k0 of the camera.
-        residual: right-hand side of the equation of `information_root` [px].
+            noise of 1 px: `root (k - k0) = information_residual` with the intrinsics k0 of the camera.
+        information_residual: right-hand side of the equation of `information_root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
@@ -47,7 +47,7 @@ class BoardPose:
     robust_weight: Float64[np.ndarray, " corners"]
     intrinsics_jacobian: Float64[np.ndarray, "6 9"]
     information_root: Float64[np.ndarray, "9 9"]
-    residual: Float64[np.ndarray, " 9"]
+    information_residual: Float64[np.ndarray, " 9"]
 
 
 def solve_board_pose(
@@ -93,7 +93,7 @@ def solve_board_pose(
         weight,
         intrinsics_jacobian=-inverse @ factor[:POSE, POSE:-1],
         information_root=factor[POSE:-1, POSE:-1],
-        residual=factor[POSE:-1, -1],
+        information_residual=factor[POSE:-1, -1],
     )
 
 

@@ -26,7 +26,7 @@ _MAX_UNDISTORT_ITERATIONS = 20
 """Largest number of Newton iterations from a distorted to the undistorted point; ordinary lenses need four."""
 
 
-class IntrinsicsSection(Section):
+class IntrinsicDeviationsSection(Section):
     """One number per intrinsic parameter of a camera, such as its standard deviation; 0 if not given.
 
     Attributes:
@@ -89,12 +89,12 @@ class CameraDocument(Section):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
-    sigma: IntrinsicsSection | None = None
+    sigma: IntrinsicDeviationsSection | None = None
     is_fixed: bool = False
 
     @field_validator("sigma")
     @classmethod
-    def _not_negative(cls, sigma: IntrinsicsSection | None) -> IntrinsicsSection | None:
+    def _not_negative(cls, sigma: IntrinsicDeviationsSection | None) -> IntrinsicDeviationsSection | None:
         """Refuse a standard deviation below 0."""
         for name, number in () if sigma is None else sigma:
             if number < 0:

@@ -130,7 +130,7 @@ def _readings(
     solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
 ) -> dict[str, torch.Tensor | tuple[str, ...]]:
     """Return the columns of `CornerSensor`; `changes` are derivatives of target poses with respect to board poses."""
-    at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
+    at_board = solved.noise / solved.prior_camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
     of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
     of_corners = [
         solved.noise**2 * change @ pose.cofactor @ change.T
@@ -140,7 +140,7 @@ def _readings(
     readings: dict[str, torch.Tensor | tuple[str, ...]] = {
         NOISE_COLUMN: torch.full((count,), at_board, dtype=torch.float64),
         WEIGHT_COLUMN: tuple(weight_text(_inverse_root(one + of_robot)) for one in of_corners),
-        CAMERA_COLUMN: (solved.camera.name,) * count,
+        CAMERA_COLUMN: (solved.prior_camera.name,) * count,
     }
     if solved.sigma.any():
         J = np.stack(changes) @ solved.intrinsics.pose_jacobian

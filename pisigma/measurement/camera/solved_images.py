@@ -62,14 +62,14 @@ class SolvedImages:
     """The poses of the board in all images of a camera.
 
     Attributes:
-        camera: the camera of the file, whose intrinsics are the prior mean.
+        prior_camera: the camera of the file, whose intrinsics are the prior mean.
         camera_of_poses: the camera with the intrinsics with which the poses were solved.
         sigma: prior standard deviations, see `prior_sigmas`.
         poses: pose of the board in every image.
         noise: standard deviation of u and v of a corner [px].
     """
 
-    camera: Camera
+    prior_camera: Camera
     camera_of_poses: Camera
     sigma: Float64[np.ndarray, " 9"]
     poses: tuple[BoardPose, ...]
@@ -79,11 +79,11 @@ class SolvedImages:
     def intrinsics(self) -> ImageIntrinsics:
         """Information of every image on the intrinsics, with the derivatives of its pose."""
         rows = (len(self.poses), len(INTRINSICS))
-        stated = (self.camera_of_poses.intrinsics, self.camera.intrinsics, self.sigma)
+        stated = (self.camera_of_poses.intrinsics, self.prior_camera.intrinsics, self.sigma)
         return ImageIntrinsics(
             np.stack([pose.intrinsics_jacobian for pose in self.poses]),
             np.stack([pose.information_root for pose in self.poses]) / self.noise,
-            np.stack([pose.residual for pose in self.poses]) / self.noise,
+            np.stack([pose.information_residual for pose in self.poses]) / self.noise,
             *(np.broadcast_to(values, rows) for values in stated),
         )
 
@@ -205,7 +205,7 @@ def calibrate_intrinsics(
         start = start.with_intrinsics(mean)
     free = np.flatnonzero(solved.sigma)
     sigma = np.zeros(len(mean))
-    residual = solved.intrinsics.residual
+    residual = solved.intrinsics.information_residual
     freedom = residual.size - len(free)
     disagreement = float(np.sqrt(np.square(residual).sum() / freedom))
     sigma[free] = max(disagreement, 1.0) * np.linalg.norm(np.linalg.inv(root[np.ix_(free, free)]), axis=1)

@@ -44,7 +44,7 @@ class Layout:
         return POSITION if POSITION[0] in self.index else ()
 
     @property
-    def lengths(self) -> tuple[str, ...]:
+    def other_measured_quantities(self) -> tuple[str, ...]:
         """Quantities other than position and orientation that make a row a measurement.
 
         They include names (of sockets and anchors), so that a name without a value is reported.

@@ -275,7 +275,9 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     except MeasurementError:
         return ""
     is_half = (mapping.has_joints or mapping.has_measured_values) and set(KEYS) & set(mapping.quantities)
-    if mapping.possible_joints or not (is_half or (mapping.has_joints and mapping.has_measured_values)):
+    if mapping.left_out_joint_columns or not (
+        is_half or (mapping.has_joints and mapping.has_measured_values)
+    ):
         return ""
     return f" The command `{_command(mapping)}` would read it as an export."
 
@@ -297,6 +299,6 @@ def _command(mapping: FileMapping) -> str:
         words += ["JOINTS", "--join", "point"]
     if units := mapping.likely_units:
         words += ["--unit", ",".join(units.values())]
-    if mapping.rotations:
+    if mapping.ambiguous_encodings:
         words += ["--rotation", "MAKER"]
     return " ".join([*words, "--out", "data.csv"])

@@ -152,7 +152,7 @@ def _check_limits(
 def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout, faults: Faults) -> None:
     """Check that position and orientation are complete or empty, that rows have a reading, and that norms are 1."""
     nothing = np.ones(len(values), dtype=bool)
-    for quantity in layout.lengths:
+    for quantity in layout.other_measured_quantities:
         filled = [bool(cell.strip()) for cell in cells[layout.index[quantity]]]
         nothing &= ~np.array(filled, dtype=bool)
     for group in filter(None, (layout.position, layout.orientation)):
@@ -160,7 +160,8 @@ def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout,
         nothing &= missing.all(1)
         _check_whole(missing, [layout.column(quantity) for quantity in group], faults)
     measured = quoted_names(
-        layout.column(quantity) for quantity in (*layout.position, *layout.orientation, *layout.lengths)
+        layout.column(quantity)
+        for quantity in (*layout.position, *layout.orientation, *layout.other_measured_quantities)
     )
     empty = Fault("nothing was measured in this row", remedy=f"fill {measured}, or remove the row")
     faults.add((row, empty) for row in rows_where(nothing))

@@ -95,13 +95,13 @@ def check_quantities_and_units(mapping: FileMapping) -> None:
                     at=mapping.place_of(column),
                     remedy="give both in one unit",
                 )
-    if mapping.rotations:
+    if mapping.ambiguous_encodings:
         raise MeasurementError(
             "the headings do not determine the encoding of the rotation",
             at=header,
             option="--rotation",
-            value=", ".join(mapping.rotations),
-            remedy=f"state one of {', '.join(mapping.rotations)}, or none to omit the rotation",
+            value=", ".join(mapping.ambiguous_encodings),
+            remedy=f"state one of {', '.join(mapping.ambiguous_encodings)}, or none to omit the rotation",
         )
     if mapping.incomplete_rotation:
         raise MeasurementError(
@@ -167,7 +167,7 @@ def _key(file: ExportFile, quantity: str, texts: list[str], unit: str) -> tuple[
     """Return names of points unchanged, and numeric times converted to seconds."""
     if quantity == "point":
         return tuple(texts)
-    numbers = [file.dialect.numbers.text(text) for text in texts]
+    numbers = [file.dialect.number_format.to_plain_number(text) for text in texts]
     return tuple(
         text if number is None else to_file_unit(number, unit)
         for text, number in zip(texts, numbers, strict=True)
@@ -177,7 +177,7 @@ def _key(file: ExportFile, quantity: str, texts: list[str], unit: str) -> tuple[
 def _column(file: ExportFile, quantity: str, column: MappedColumn) -> tuple[str, tuple[str, ...]]:
     """Return the name and the cells of a column of measurement files."""
     unit = column.target.unit
-    written = UNITS[unit].column if unit else ""
+    written = UNITS[unit].file_unit if unit else ""
     if quantity in RPY and written == "rad":
         numbers = _numbers(file, column)
         return f"{quantity}_deg", tuple(repr(math.degrees(float(text))) if text else "" for text in numbers)
@@ -213,9 +213,9 @@ def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
     """
     numbers = []
     for line, cell in zip(file.lines, file.column(column.index), strict=True):
-        number = "" if is_missing(cell) else file.dialect.numbers.text(cell)
+        number = "" if is_missing(cell) else file.dialect.number_format.to_plain_number(cell)
         if number is None:
-            sign = "point" if file.dialect.numbers.decimal == "." else "comma"
+            sign = "point" if file.dialect.number_format.decimal == "." else "comma"
             raise MeasurementError(
                 expected=f"a number with a decimal {sign}",
                 value=cell,
@@ -235,7 +235,7 @@ def _rotation(
     """Return the quaternions of all rows as strings, by column; "" in rows without a rotation."""
     rows = list(zip(*(_numbers(file, column) for column in columns), strict=True))
     values = torch.tensor([[float(text or "nan") for text in row] for row in rows], dtype=torch.float64)
-    if columns[0].target.unit and UNITS[columns[0].target.unit].column == "deg":
+    if columns[0].target.unit and UNITS[columns[0].target.unit].file_unit == "deg":
         values = values.deg2rad()
     measured = torch.tensor([any(row) for row in rows], dtype=torch.bool)
     wrong = measured & ~encoding.is_rotation(values)

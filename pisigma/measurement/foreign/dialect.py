@@ -46,7 +46,7 @@ class NumberFormat:
 
     decimal: Decimal
 
-    def text(self, cell: str) -> str | None:
+    def to_plain_number(self, cell: str) -> str | None:
         """Return a number with a decimal point, all digits and no groups; None if the cell is not a number."""
         if _PLAIN[self.decimal].fullmatch(cell):
             return cell if self.decimal == "." else cell.replace(",", ".")
@@ -63,7 +63,7 @@ class NumberFormat:
 
         A group of thousands without decimals, such as 1,234, may also be a number with three decimals.
         """
-        text = self.text(cell)
+        text = self.to_plain_number(cell)
         if text is None:
             return 0.0
         other = "," if self.decimal == "." else "."
@@ -100,16 +100,16 @@ class Dialect:
 
     Attributes:
         separator: separator of cells, one of `_SEPARATORS`.
-        numbers: format of numbers.
+        number_format: format of numbers.
     """
 
     separator: str
-    numbers: NumberFormat
+    number_format: NumberFormat
 
     def __str__(self) -> str:
         """Return a description such as "semicolons between cells, decimal commas"."""
         signs = {".": "points", ",": "commas", "\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces"}
-        return f"{signs[self.separator]} between cells, decimal {signs[self.numbers.decimal]}"
+        return f"{signs[self.separator]} between cells, decimal {signs[self.number_format.decimal]}"
 
     def split(self, line: str) -> list[str]:
         """Return the cells of a line without surrounding spaces; an unclosed quote is part of the cell."""
@@ -133,7 +133,7 @@ class Dialect:
 
     def is_number(self, cell: str) -> bool:
         """Return whether a cell is a number."""
-        return self.numbers.text(cell) is not None
+        return self.number_format.to_plain_number(cell) is not None
 
 
 def detect_dialect(
@@ -185,13 +185,13 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
     Raises:
         MeasurementError: the numbers of the table are ambiguous.
     """
-    sign, width = dialect.numbers.decimal, Counter(len(row) for _, row in rows).most_common(1)[0][0]
+    sign, width = dialect.number_format.decimal, Counter(len(row) for _, row in rows).most_common(1)[0][0]
     columns = [
         [(number, row[k]) for number, row in rows if len(row) == width and dialect.is_number(row[k])]
         for k in range(width)
     ]
     signed = [[(number, cell) for number, cell in column if sign in cell] for column in columns]
-    is_ambiguous = dialect.numbers.is_ambiguous
+    is_ambiguous = dialect.number_format.is_ambiguous
     if not is_ambiguous(cell for column in columns for _, cell in column):
         signed = [
             ours
@@ -239,5 +239,7 @@ def _score(dialect: Dialect, lines: Sequence[str]) -> float:
         return 0.0
     width = Counter(map(len, numeric)).most_common(1)[0][0]
     cells = [cell for row in numeric if len(row) == width for cell in row if not is_missing(cell)]
-    certain = sum(map(dialect.numbers.certainty, cells)) * (_BLANKS if dialect.separator == " " else 1.0)
+    certain = sum(map(dialect.number_format.certainty, cells)) * (
+        _BLANKS if dialect.separator == " " else 1.0
+    )
     return len([row for row in numeric if len(row) == width]) / len(rows) * certain / len(cells)

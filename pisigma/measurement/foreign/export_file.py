@@ -78,7 +78,7 @@ class ExportFile:
 
     def numbers(self, index: int) -> list[float]:
         """Return the numbers of a column in the file's unit; cells that are not numbers are omitted."""
-        texts = (self.dialect.numbers.text(cell) for cell in self.column(index))
+        texts = (self.dialect.number_format.to_plain_number(cell) for cell in self.column(index))
         return [float(text) for text in texts if text is not None]
 
 
@@ -117,7 +117,7 @@ def read_export(
     used = [
         k for k in range(width - ends_empty) if (headings and headings[k]) or any(cells[i][k] for i in rows)
     ]
-    summaries = summary_rows([[cells[i][k] for k in used] for i in rows], dialect.numbers)
+    summaries = summary_rows([[cells[i][k] for k in used] for i in rows], dialect.number_format)
     skipped += [LeftOutRow(source, lines[rows[row]][0], why) for row, why in sorted(summaries.items())]
     text_of = dict(lines)
     comments = [text_of[row.line] for row in skipped if row.line not in {lines[i][0] for i in rows}]

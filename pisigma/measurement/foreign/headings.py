@@ -81,30 +81,30 @@ class MakerHeadings:
     Attributes:
         name: name of the manufacturer.
         joints: names of the joints in order, or one name that is followed by numbers; "" if the names are not specific.
-        rotation: name of the manufacturer's encoding of rotations.
-        position: name of the coordinate x, if it is needed to recognise the manufacturer.
-        length: unit of all lengths; "" if it is configurable.
-        angle: unit of all angles; "" if it is configurable.
+        rotation_encoding: name of the manufacturer's encoding of rotations.
+        x_heading: name of the coordinate x, if it is needed to recognise the manufacturer.
+        length_unit: unit of all lengths; "" if it is configurable.
+        angle_unit: unit of all angles; "" if it is configurable.
     """
 
     name: str
     joints: str = ""
-    rotation: str = ""
-    position: str = ""
-    length: str = ""
-    angle: str = ""
+    rotation_encoding: str = ""
+    x_heading: str = ""
+    length_unit: str = ""
+    angle_unit: str = ""
 
 
 MAKERS = (
-    MakerHeadings("KUKA", "a#", "kuka", length="mm", angle="deg"),
-    MakerHeadings("ABB", "rax#", "abb", length="mm", angle="deg"),
-    MakerHeadings("Kawasaki", "jt#", "kawasaki", length="mm", angle="deg"),
-    MakerHeadings("Yaskawa", "s l u r b t", "yaskawa", length="mm", angle="deg"),
+    MakerHeadings("KUKA", "a#", "kuka", length_unit="mm", angle_unit="deg"),
+    MakerHeadings("ABB", "rax#", "abb", length_unit="mm", angle_unit="deg"),
+    MakerHeadings("Kawasaki", "jt#", "kawasaki", length_unit="mm", angle_unit="deg"),
+    MakerHeadings("Yaskawa", "s l u r b t", "yaskawa", length_unit="mm", angle_unit="deg"),
     MakerHeadings("Universal Robots", "q#", "ur", "tcppose0", "m", "rad"),
     MakerHeadings("Universal Robots", "base shoulder elbow wrist1 wrist2 wrist3", "ur"),
-    MakerHeadings("FANUC", "", "fanuc", length="mm", angle="deg"),
-    MakerHeadings("Epson", "", "epson", length="mm", angle="deg"),
-    MakerHeadings("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
+    MakerHeadings("FANUC", "", "fanuc", length_unit="mm", angle_unit="deg"),
+    MakerHeadings("Epson", "", "epson", length_unit="mm", angle_unit="deg"),
+    MakerHeadings("Kawasaki", "", "kawasaki", length_unit="mm", angle_unit="deg"),
 )
 """Column names of manufacturers, one per line. Manufacturers without specific joint names are recognised by their
 rotations."""

@@ -101,7 +101,9 @@ class LeRobotDataset:
         for file in self.files:
             yield file, read_table(file)
 
-    def frames(self, table: "pyarrow.Table", feature: str, file: Path) -> Float[np.ndarray, "frames values"]:
+    def feature_values(
+        self, table: "pyarrow.Table", feature: str, file: Path
+    ) -> Float[np.ndarray, "frames values"]:
         """Return the values of a feature in one of the `tables`, (frames, values).
 
         Raises:
@@ -267,7 +269,7 @@ def read_joint_log(
     scale = np.rad2deg([radians_per_unit(units, motor, known) for motor in motors])
     rows = []
     for file, table in source.tables():
-        recorded = source.frames(table, STATE, file)[:, columns].astype(np.float64)
+        recorded = source.feature_values(table, STATE, file)[:, columns].astype(np.float64)
         check_values(recorded, units, tuple(motors), known, file)
         values = recorded * scale
         keys = (table.column(name).to_pylist() for name in ("episode_index", "frame_index", "timestamp"))

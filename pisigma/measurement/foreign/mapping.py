@@ -53,13 +53,13 @@ class FileMapping:
     Attributes:
         file: the export.
         columns: all columns, in the order of the file.
-        rotations: encodings of rotations that fit the headings; () if at most one does.
+        ambiguous_encodings: encodings of rotations that fit the headings; () if at most one does.
         incomplete_rotation: columns that contain some but not all values of a rotation; () if there are none.
     """
 
     file: ExportFile
     columns: tuple[MappedColumn, ...]
-    rotations: tuple[str, ...] = ()
+    ambiguous_encodings: tuple[str, ...] = ()
     incomplete_rotation: tuple[MappedColumn, ...] = ()
 
     @property
@@ -111,7 +111,7 @@ class FileMapping:
         return next(filter(None, self.file.column(column.index)), "")
 
     @property
-    def possible_joints(self) -> list[MappedColumn]:
+    def left_out_joint_columns(self) -> list[MappedColumn]:
         """Columns that are left out although they are named like joints."""
         left_out = [
             one for one in self.columns if one.target.quantity == LEFT_OUT and one.reason == UNRECOGNISED
@@ -148,7 +148,7 @@ def map_columns(
     incomplete = (
         () if rotation == NO_ROTATION else tuple(columns[index] for index in incomplete_rotation(proposal))
     )
-    return FileMapping(file, _with_units(columns, proposal, units), proposal.rotations, incomplete)
+    return FileMapping(file, _with_units(columns, proposal, units), proposal.ambiguous_encodings, incomplete)
 
 
 def _take_stated(proposal: Proposal, name: str, text: str) -> None:
@@ -245,8 +245,8 @@ def _units_of_maker(
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (
-        ("angle", maker.angle, joint_columns(columns) or rotation_columns(columns)),
-        ("length", maker.length, position_columns(columns)),
+        ("angle", maker.angle_unit, joint_columns(columns) or rotation_columns(columns)),
+        ("length", maker.length_unit, position_columns(columns)),
     )
     return {
         kind: symbol
@@ -285,7 +285,7 @@ def mapping_warnings(mapping: FileMapping) -> tuple[str, ...]:
 
     Every sentence states file, line and column.
     """
-    sentences = [_left_out(mapping, one) for one in mapping.possible_joints]
+    sentences = [_left_out(mapping, one) for one in mapping.left_out_joint_columns]
     groups = (
         ("joint values", joint_columns(mapping.columns)),
         ("coordinates", position_columns(mapping.columns)),
@@ -306,7 +306,7 @@ def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit:
         (abs(float(number)), line, column)
         for column in columns
         for line, cell in zip(mapping.file.lines, mapping.file.column(column.index), strict=True)
-        if (number := mapping.file.dialect.numbers.text(cell)) is not None
+        if (number := mapping.file.dialect.number_format.to_plain_number(cell)) is not None
     ]
     largest, line, column = max(values, key=lambda one: one[0], default=(0.0, 0, columns[0]))
     if name.startswith("angles") and largest < _MIN_TILT:

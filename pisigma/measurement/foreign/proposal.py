@@ -39,13 +39,13 @@ class Proposal:
         file: the export.
         columns: mapped columns by index.
         maker: the manufacturer that uses these column names; None if several do.
-        rotations: encodings of rotations that fit the headings, if there are several.
+        ambiguous_encodings: encodings of rotations that fit the headings, if there are several.
     """
 
     file: ExportFile
     columns: dict[int, MappedColumn] = field(default_factory=dict)
     maker: MakerHeadings | None = None
-    rotations: tuple[str, ...] = ()
+    ambiguous_encodings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Parse the headings."""
@@ -203,7 +203,7 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
 
 def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
     """Return whether the last 16 columns are the rows of homogeneous transforms."""
-    ends = {tuple(map(file.dialect.numbers.text, record[-4:])) for record in file.records}
+    ends = {tuple(map(file.dialect.number_format.to_plain_number, record[-4:])) for record in file.records}
     last = [0.0, 0.0, 0.0, 1.0]
     return len(file.headings) >= 16 + leading and all(
         None not in end and [float(text or 9) for text in end] == last for end in ends
@@ -219,7 +219,7 @@ def _take_joints(proposal: Proposal) -> None:
     if not all(one.is_stated for one in stated):
         return
     names = proposal.columns_by_name("angle", "length")
-    makers = [one for one in MAKERS if one.joints and (not one.position or one.position in names)]
+    makers = [one for one in MAKERS if one.joints and (not one.x_heading or one.x_heading in names)]
     general = (MakerHeadings("", f"{name}#") for name in JOINT_NAMES)
     best: dict[str, int] = {}
     shift, most = 0, 1
@@ -285,10 +285,10 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
         for group in matches.values():
             proposal.leave_out(group, names, "--rotation none")
         return
-    chosen = rotation or (proposal.maker.rotation if proposal.maker else "")
+    chosen = rotation or (proposal.maker.rotation_encoding if proposal.maker else "")
     if rotation is None and chosen not in matches and len(matches) == 1:
         chosen = next(iter(matches))
-        makers = [one for one in MAKERS if not one.joints and one.rotation == chosen]
+        makers = [one for one in MAKERS if not one.joints and one.rotation_encoding == chosen]
         proposal.maker = proposal.maker or next(iter(makers), None)
     if chosen in matches:
         encoding = ROTATIONS[chosen]
@@ -296,7 +296,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
         group = dict(zip(matches[chosen], quantities, strict=True))
         proposal.assign_columns(group, names, "measured", f"{chosen}: {encoding.meaning}")
     elif rotation is None:
-        proposal.rotations = tuple(matches)
+        proposal.ambiguous_encodings = tuple(matches)
     elif matches:
         headings = ", ".join(next(iter(matches.values())))
         raise MeasurementError(
@@ -340,7 +340,7 @@ def _take_third_coordinate(proposal: Proposal) -> None:
         return
     open_rotations = [
         name
-        for one in proposal.rotations
+        for one in proposal.ambiguous_encodings
         for names in (ROTATIONS[one].values, *ROTATIONS[one].aliases)
         for name in names
     ]

@@ -59,7 +59,7 @@ def summary_rows(records: Sequence[Sequence[str]], number_format: NumberFormat) 
         for row, name in named.items()
     }
     unnamed = [row for row in range(len(records)) if row not in named]
-    texts = [[number_format.text(cell) for cell in records[row]] for row in unnamed]
+    texts = [[number_format.to_plain_number(cell) for cell in records[row]] for row in unnamed]
     after = _count_statistics(texts)
     before = 0 if after else _count_statistics(texts[::-1])
     why = "the row is the mean, or another statistic, of the rows"
@@ -87,7 +87,7 @@ def _holds_means(records: Sequence[Sequence[str]], numbers: NumberFormat, named:
     """Return whether any row that is named as a mean is the mean of the rows since the previous such row."""
     group: list[list[str | None]] = []
     for row, record in enumerate(records):
-        texts = [numbers.text(cell) for cell in record]
+        texts = [numbers.to_plain_number(cell) for cell in record]
         if row not in named:
             group.append(texts)
             continue

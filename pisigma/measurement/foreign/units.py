@@ -22,13 +22,13 @@ class ForeignUnit:
 
     Attributes:
         kind: the measured quantity.
-        column: unit of measurement files to which values are converted.
+        file_unit: unit of measurement files to which values are converted.
         factor: exact conversion factor to that unit.
         spellings: spellings in addition to the symbol, in lower case.
     """
 
     kind: UnitKind
-    column: str
+    file_unit: str
     factor: str = "1"
     spellings: str = ""
 

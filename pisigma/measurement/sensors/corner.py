@@ -129,9 +129,11 @@ class CornerSensor(AbstractSensor):
         data, present = rows.measurements, rows.has_corner_poses
         if data.position is None or data.rotation is None or not bool(present.any()):
             return None
-        R, p = rows.bases[:, :3, :3], rows.bases[:, :3, 3]
+        R, p = rows.base_anchors[:, :3, :3], rows.base_anchors[:, :3, 3]
         eye = torch.eye(3).to(R)
-        rotation = torch.where(present[:, None, None], R.mT @ data.rotation @ rows.tools.mT, eye)
+        rotation = torch.where(
+            present[:, None, None], R.mT @ data.rotation @ rows.tool_rotation_anchors.mT, eye
+        )
         position = torch.where(present, ((data.position - p)[:, None] @ R)[:, 0].t(), 0.0)
         weight = _scaled_weights(data)
         # errors are in the frame of the base's anchor, weights in the axes of the row's frame
@@ -148,10 +150,10 @@ class CornerSensor(AbstractSensor):
             rotation.permute(1, 2, 0).contiguous(),
             rotated.permute(1, 2, 0),
             present,
-            camera=rows.numbers(of_camera, distinct_names(of_camera)),
+            camera=rows.name_indices(of_camera, distinct_names(of_camera)),
             intrinsics=at.t(),
             intrinsics_jacobian=(weight @ by).permute(1, 2, 0),
-            board=rows.numbers(of_board, distinct_names(of_board)),
+            board=rows.name_indices(of_board, distinct_names(of_board)),
             scale_derivative=scale_derivative,
         )
 

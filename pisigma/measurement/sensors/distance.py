@@ -65,7 +65,7 @@ class AnchorSensor(AbstractSensor):
         names = distinct_names(data.anchor)
         if data.distance is None or not names:
             return None
-        number = rows.numbers(data.anchor, names)
+        number = rows.name_indices(data.anchor, names)
         present = data.is_measured("distance") & (number >= 0)
         return cls(number, torch.where(present, data.distance, 0.0), present, rows.sigma(present))
 

@@ -53,20 +53,20 @@ class ImageIntrinsics:
     Attributes:
         pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
             respect to k.
-        information_root: matrix of the equations of k with the poses eliminated, `root (k - intrinsics) = residual`
-            with unit variances.
-        residual: right-hand side of the equations of `information_root`.
+        information_root: matrix of the equations of k with the poses eliminated, `root (k - intrinsics) =
+            information_residual` with unit variances.
+        information_residual: right-hand side of the equations of `information_root`.
         intrinsics: intrinsics at which the images were linearised.
         prior_mean: intrinsics of the camera file, the prior mean.
-        sigma: prior standard deviations; 0 for fixed intrinsics.
+        prior_sigma: prior standard deviations; 0 for fixed intrinsics.
     """
 
     pose_jacobian: Float64[np.ndarray, "*rows 6 9"]
     information_root: Float64[np.ndarray, "*rows 9 9"]
-    residual: Float64[np.ndarray, "*rows 9"]
+    information_residual: Float64[np.ndarray, "*rows 9"]
     intrinsics: Float64[np.ndarray, "*rows 9"]
     prior_mean: Float64[np.ndarray, "*rows 9"]
-    sigma: Float64[np.ndarray, "*rows 9"]
+    prior_sigma: Float64[np.ndarray, "*rows 9"]
 
     def select(self, rows: Bool[np.ndarray, " rows"]) -> "ImageIntrinsics":
         """Return the information of the chosen images."""
@@ -99,12 +99,14 @@ def intrinsics_information(
         U [1/px; 1 for distortion], where `U^T U` is the information (0 for fixed intrinsics), and the mean [px; 1 for
         distortion].
     """
-    sigma, at = images.sigma[0], images.intrinsics[0]
+    sigma, at = images.prior_sigma[0], images.intrinsics[0]
     free = np.flatnonzero(sigma > 0)
     # in units of the prior standard deviations, in which the information of the prior is the identity
     scaled = images.information_root[:, :, free] * sigma[free]
     information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
-    residual = images.residual + np.einsum("nij,nj->ni", images.information_root, images.intrinsics - at)
+    residual = images.information_residual + np.einsum(
+        "nij,nj->ni", images.information_root, images.intrinsics - at
+    )
     pull = np.einsum("nij,ni->j", scaled, residual) + (images.prior_mean[0] - at)[free] / sigma[free]
     U, mean = np.zeros((NUMBERS, NUMBERS)), at.copy()
     U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
@@ -126,7 +128,9 @@ def without_stated_priors(
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
     images, names = ImageIntrinsics.from_csv_cells(stated), cameras(measurements) or ("",) * len(stated)
     is_counted = np.array([name in included.get("camera", ()) for name in names])
-    images = replace(images, sigma=np.where(is_counted[:, None], _UNINFORMATIVE, 1.0) * images.sigma)
+    images = replace(
+        images, prior_sigma=np.where(is_counted[:, None], _UNINFORMATIVE, 1.0) * images.prior_sigma
+    )
     texts = {
         INTRINSICS_COLUMN: tuple(
             text if name else "" for name, text in zip(names, images.csv_cells, strict=True)
@@ -271,7 +275,7 @@ class IntrinsicsSensor(AbstractSensor):
         images = ImageIntrinsics.from_csv_cells(texts_of(measurements, INTRINSICS_COLUMN))
         first = [names.index(name) for name in distinct_names(names)]
         return InitialUnknowns(
-            torch.from_numpy(images.prior_mean[first]), torch.from_numpy(images.sigma[first] > 0)
+            torch.from_numpy(images.prior_mean[first]), torch.from_numpy(images.prior_sigma[first] > 0)
         )
 
 

@@ -45,7 +45,7 @@ class PositionSensor(AbstractSensor):
         present = (data.is_measured("position") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.position is None or not bool(present.any()):
             return None
-        R, p = rows.bases[:, :3, :3], rows.bases[:, :3, 3]
+        R, p = rows.base_anchors[:, :3, :3], rows.base_anchors[:, :3, 3]
         position = ((data.position - p)[:, None] @ R)[:, 0]
         return cls(torch.where(present, position.t(), 0.0).contiguous(), present, rows.sigma(present))
 
@@ -83,7 +83,7 @@ class RotationSensor(AbstractSensor):
         present = (data.is_measured("rotation") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.rotation is None or not bool(present.any()):
             return None
-        rotation = rows.bases[:, :3, :3].mT @ data.rotation @ rows.tools.mT
+        rotation = rows.base_anchors[:, :3, :3].mT @ data.rotation @ rows.tool_rotation_anchors.mT
         eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
         rotation = torch.where(present[:, None, None], rotation, eye).permute(1, 2, 0).contiguous()
         return cls(rotation, present, rows.sigma(present, "rad"))
@@ -148,8 +148,8 @@ class TouchSensor(AbstractSensor):
         present = data.is_measured("touch")
         if data.touch is None or not bool(present.any()):
             return None
-        axis = rows.numbers(data.touch_axis, ("x", "y", "z"))
-        lines = rows.bases[torch.arange(data.rows, device=axis.device), axis]
+        axis = rows.name_indices(data.touch_axis, ("x", "y", "z"))
+        lines = rows.base_anchors[torch.arange(data.rows, device=axis.device), axis]
         measured = torch.where(present, data.touch - lines[:, 3], 0.0)
         return cls(lines[:, :3].t().contiguous(), measured, present, rows.sigma(present))
 

@@ -89,13 +89,13 @@ class SensorRows:
 
     Attributes:
         measurements: the rows; pairs come first, with their rows next to each other.
-        bases: per row, the anchor of the base, `T_frame_tool = anchor · T_anchor_tool`.
-        tools: per row, the anchor of the tool's rotation, `R_anchor_tool = R_predicted · anchor`.
+        base_anchors: per row, the anchor of the base, `T_frame_tool = anchor · T_anchor_tool`.
+        tool_rotation_anchors: per row, the anchor of the tool's rotation, `R_anchor_tool = R_predicted · anchor`.
     """
 
     measurements: Measurements
-    bases: Float64[Tensor, "rows 4 4"]
-    tools: Float64[Tensor, "rows 3 3"]
+    base_anchors: Float64[Tensor, "rows 4 4"]
+    tool_rotation_anchors: Float64[Tensor, "rows 3 3"]
 
     def sigma(
         self, present: Bool[Tensor, " rows"], unit: Literal["m", "rad"] = "m"
@@ -129,7 +129,7 @@ class SensorRows:
         values = self.measurements.readings.get(name)
         return values if isinstance(values, Tensor) else torch.full_like(self.measurements.q[:, 0], torch.nan)
 
-    def numbers(self, names: tuple[str, ...] | None, order: tuple[str, ...]) -> Int64[Tensor, " rows"]:
+    def name_indices(self, names: tuple[str, ...] | None, order: tuple[str, ...]) -> Int64[Tensor, " rows"]:
         """Return the index of every row's name in `order`; -1 if `order` does not contain it."""
         return indices_of_names(names, order, self.measurements.rows).to(self.measurements.q.device)
 

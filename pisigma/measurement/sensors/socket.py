@@ -63,7 +63,7 @@ class SocketSensor(AbstractSensor):
         present = rows.measurements.is_measured("socket")
         if not bool(present.any()):
             return None
-        return cls(rows.numbers(names, distinct_names(names)), present, rows.sigma(present))
+        return cls(rows.name_indices(names, distinct_names(names)), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the socket's position minus the tool's position [m]."""

@@ -262,7 +262,7 @@ def _training_values(robot: Robot, numbers: Tensor, measured: Tensor, steps: Ten
         raise InconsistentFolderError(
             f"the tensors {', '.join(_ROWS)} differ in their number of rows", file=WEIGHTS, value=_ROWS[0]
         )
-    return RowValues.stored_values(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
+    return RowValues.from_stored_numbers(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 
 
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:

@@ -74,14 +74,14 @@ class Upgrade:
 
     Attributes:
         name: name of the model.
-        before: format of the folder before the upgrade.
-        after: format after the upgrade; equal to `before` if there was nothing to do.
+        format_before: format of the folder before the upgrade.
+        format_after: format after the upgrade; equal to `format_before` if there was nothing to do.
         changes: sentences about differences in the behaviour of the model.
     """
 
     name: str
-    before: int
-    after: int
+    format_before: int
+    format_after: int
     changes: tuple[str, ...] = ()
 
 

@@ -173,7 +173,7 @@ class ControllerValuesSolver:
         allowed = ~excluded & np.isfinite(every).all(-1)
         if near is None:
             # Without a previous posture, the order of the model's branches determines the choice.
-            cost = np.argsort(self.ik.order)[None].astype(float)
+            cost = np.argsort(self.ik.branch_order)[None].astype(float)
         else:
             cost = np.abs(every - np.broadcast_to(near, q.shape)[outside].reshape(-1, 1, q.shape[-1])).sum(-1)
         best = np.where(allowed, cost, np.inf).argmin(-1)

@@ -38,15 +38,15 @@ class CorrectedIK(AbstractInverse):
         name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        order: indices of the branches, in order of decreasing numbers of training rows.
+        branch_order: indices of the branches, in order of decreasing numbers of training rows.
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
         warnings: warnings about conditions given to `under` outside the range of the calibration, or modelled torques.
-        controller: conversion to the controller's values for coupled joints; None if there are none.
+        controller_solver: conversion to the controller's values for coupled joints; None if there are none.
     """
 
-    controller: "pisigma.model.inverse.controller_values.ControllerValuesSolver | None"
+    controller_solver: "pisigma.model.inverse.controller_values.ControllerValuesSolver | None"
 
     def __init__(self, model: "pisigma.model.calibrated_model.CalibratedModel") -> None:
         """Prepare a model for calls.
@@ -58,20 +58,20 @@ class CorrectedIK(AbstractInverse):
         from pisigma.model.stated_conditions import condition_warnings
 
         route = NumericIK(model)
-        self.name, self.branches, self.order = model.name, route.branches, route.order
+        self.name, self.branches, self.branch_order = model.name, route.branches, route.branch_order
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
         self.warnings = condition_warnings(model)
         self.model, self.numeric = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
-        self.controller = None
+        self.controller_solver = None
         if model.robot.coupling is not None:
             from pisigma.model.inverse.controller_values import ControllerValuesSolver
 
             axes = model.robot.axes
             of_joints = replace(model, robot=replace(model.robot, coupling=None))
-            self.controller = ControllerValuesSolver(CorrectedIK(of_joints), model.robot.coupling)
+            self.controller_solver = ControllerValuesSolver(CorrectedIK(of_joints), model.robot.coupling)
             self.joints, self.limits = tuple(axis.name for axis in axes), model.robot.axis_limits
             self.revolute = np.array([axis.type == "revolute" for axis in axes])
 
@@ -85,9 +85,9 @@ class CorrectedIK(AbstractInverse):
         ik = cls.__new__(cls)
         arms, form = kernels.description.arms, kernels.description.closed_form
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
-        ik.order = tuple(int(index) for index in form.order)
+        ik.branch_order = tuple(int(index) for index in form.order)
         ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
-        ik.warnings, ik.controller = kernels.warnings, None
+        ik.warnings, ik.controller_solver = kernels.warnings, None
         ik.closed_form = bool(kernels.description.forms.closed_forms)
         ik._read, ik.compiled = read, kernels
         return ik
@@ -140,7 +140,7 @@ class CorrectedIK(AbstractInverse):
                 Among the branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to
                 `near` as their limits allow. Distances add radians and metres with equal weight.
             branch: name of the branch to use; `near` then only affects how joint values are wrapped. The default is
-                the first branch in `order` that reaches the pose, preferably inside the joint limits.
+                the first branch in `branch_order` that reaches the pose, preferably inside the joint limits.
             throw: False for control loops: an invalid pose, or a `near` that is not finite or plausible for the robot,
                 then raises no error; its solution is NaN with the status INVALID_POSE.
             approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose,
@@ -161,8 +161,8 @@ class CorrectedIK(AbstractInverse):
         if near is not None:
             near = self.plausible_joints.check_near(near, throw)
         approach = checked_approach(approach)
-        if task.controller is not None:
-            return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
+        if (solver := task.controller_solver) is not None:
+            return solver.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
             return kernels.solve(T_base_tool, near, branch, throw, approach, self, axes)
@@ -181,8 +181,8 @@ class CorrectedIK(AbstractInverse):
         Without a closed-form inverse, kernels find up to eight distinct solutions.
         """
         approach = checked_approach(approach)
-        if self.controller is not None:
-            return self.controller.all_branches(T_base_tool, self, approach=approach)
+        if self.controller_solver is not None:
+            return self.controller_solver.all_branches(T_base_tool, self, approach=approach)
         T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
         every = route.all_branches(T, approach=approach, is_float32=single, axes=self.task_axes)
@@ -218,8 +218,8 @@ class CorrectedIK(AbstractInverse):
             PoseError: q does not match the robot's joints, or `approach` is invalid or given where torch is used.
         """
         approach = checked_approach(approach)
-        if self.controller is not None:
-            return self.controller.forward(q, approach)
+        if self.controller_solver is not None:
+            return self.controller_solver.forward(q, approach)
         kernels = self._kernels_of(q)
         if kernels is None and approach is not None:
             raise PoseError(
@@ -239,8 +239,8 @@ class CorrectedIK(AbstractInverse):
 
         The slope of the correction, about 1e-3, and a network on nominal joint values are neglected. See `forward`.
         """
-        if self.controller is not None:
-            return self.controller.jacobian(q)
+        if self.controller_solver is not None:
+            return self.controller_solver.jacobian(q)
         kernels = self._kernels_of(q, forward=False)
         if kernels is None:
             return call_model(self.model.jacobian, q)
@@ -273,8 +273,8 @@ class CorrectedIK(AbstractInverse):
         from pisigma.model.accuracy import position_accuracy
 
         approach = checked_approach(approach)
-        if self.controller is not None:
-            return self.controller.accuracy(q, approach)
+        if self.controller_solver is not None:
+            return self.controller_solver.accuracy(q, approach)
         return call_model(partial(position_accuracy, self.model, approach=approach), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
@@ -292,8 +292,8 @@ class CorrectedIK(AbstractInverse):
     @cached_property
     def task_axes(self) -> TaskAxes:
         """Axes of the tool that are constrained unless a call states others."""
-        if self.controller is not None:
-            return self.controller.ik.task_axes
+        if self.controller_solver is not None:
+            return self.controller_solver.ik.task_axes
         return self.numeric.task_axes if self.compiled is None else self.compiled.task_axes
 
     def for_task(
@@ -343,8 +343,8 @@ class CorrectedIK(AbstractInverse):
         """
         ik = copy(self)
         ik.task_axes = axes
-        if self.controller is not None:
-            ik.controller = self.controller.with_axes(axes)
+        if self.controller_solver is not None:
+            ik.controller_solver = self.controller_solver.with_axes(axes)
         return ik
 
     def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:

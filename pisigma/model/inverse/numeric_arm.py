@@ -82,7 +82,7 @@ class NumericArm:
         distance: Tensor = (T[..., :3, 3] - T.new_tensor(self.robot.base[:3].tolist())).norm(dim=-1)
         return distance <= self.robot.reach * (1 + tolerances.REACH_ROUNDING)
 
-    def reach(
+    def iterate_to_poses(
         self, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
         """Iterate from a start for every pose; return joint values [rad or m] and whether they reach the pose.
@@ -155,7 +155,7 @@ class NumericArm:
     ) -> Float64[Tensor, " poses"]:
         """Compute the smallest singular value of the dimensionless Jacobian in the constrained axes."""
         _, J = self._task.errors(T, q)
-        return smallest_singular_value(self.robot, J, self._task.rows)
+        return smallest_singular_value(self.robot, J, self._task.used_axis_count)
 
     @cached_property
     def _task(self) -> TaskMotion:

@@ -41,7 +41,7 @@ class NumericIK:
     Attributes:
         model: calibrated model.
         branches: names of the branches.
-        order: indices of the branches: those of training rows, most frequent first, then all others.
+        branch_order: indices of the branches: those of training rows, most frequent first, then all others.
         task_axes: axes of the tool that are constrained.
     """
 
@@ -69,7 +69,10 @@ class NumericIK:
                 remedy="train it again",
             )
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
-        self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
+        self.branch_order = (
+            *trained,
+            *(index for index in range(len(self.branches)) if index not in trained),
+        )
         self._trained = torch.tensor(trained)
         whole = model.network is not None and self._solver is None
         self.task_axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
@@ -109,7 +112,7 @@ class NumericIK:
         """
         if branch is not None:
             check_choice(PoseError, "branch", branch, self.branches)
-        requested = self.order if branch is None else (self.branches.index(branch),)
+        requested = self.branch_order if branch is None else (self.branches.index(branch),)
         poses = _Poses.from_values(T_base_tool, is_float32, throw)
         valid, near_rows = poses.valid, None
         if near is not None:
@@ -135,7 +138,7 @@ class NumericIK:
         poses = _Poses.from_values(T_base_tool, is_float32, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
-            every = ik._candidates(poses.T[rows], poses.single, None, ik.order)
+            every = ik._candidates(poses.T[rows], poses.single, None, ik.branch_order)
             own = [_best(*every, (index,)) for index in range(len(ik.branches))]
             return own[0].map(lambda *values: torch.stack(values, 1), *own[1:])
 
@@ -228,7 +231,7 @@ class NumericIK:
         usable = torch.isfinite(starts).all(-1) & self._arm.within_reach(T)[:, None]
         pose, place = usable.nonzero().unbind(1)
         start, known = starts[pose, place], branch[pose, place] >= 0
-        q, reached = self._arm.reach(T[pose], start)
+        q, reached = self._arm.iterate_to_poses(T[pose], start)
         if self.model.calibrated is None:  # the closed form already allows for the rounding of the pose
             q, reached = torch.where(known[:, None], start, q), known | reached
         kept = reached.nonzero()[:, 0]
@@ -268,7 +271,7 @@ class NumericIK:
         reached = torch.ones_like(inside)
         if self.model.hybrid is not None:
             if not self.model.hybrid.correction.is_periodic:  # the correction depends on the turn of a joint
-                commanded, reached = self._arm.reach(T, commanded)
+                commanded, reached = self._arm.iterate_to_poses(T, commanded)
                 inside = (wrap_into_limits(robot, commanded)[0] == commanded).all(-1) & inside
             measure = 1 + self.model.hybrid.coverage.distance_outside(commanded).amax(-1)
         nominal = nearest_turn(robot, nominal, commanded, within_limits=False)
@@ -326,7 +329,7 @@ class NumericIK:
         elif self._spare:
             rank = -self._arm.posture_rating(T, q)
         else:
-            rank = torch.tensor(self.order).argsort()[branch].double()
+            rank = torch.tensor(self.branch_order).argsort()[branch].double()
         return rank
 
 

@@ -136,7 +136,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     # The cost of starting on each branch follows from the requested branch, the joint motion from `near`, or the usual
     # order.
     first = np.zeros(len(ik.branches))
-    for place, index in enumerate(ik.order):
+    for place, index in enumerate(ik.branch_order):
         first[index] = _LATER * place
     if branch is not None:
         first += _OTHER_BRANCH * (np.arange(len(first)) != ik.branches.index(branch))

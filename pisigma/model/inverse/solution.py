@@ -22,7 +22,7 @@ class AbstractInverse(ABC):
     name: str
     branches: tuple[str, ...]
     joints: tuple[str, ...]
-    order: tuple[int, ...]
+    branch_order: tuple[int, ...]
     limits: np.ndarray
     revolute: np.ndarray
     closed_form: bool

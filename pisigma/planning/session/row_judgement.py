@@ -265,11 +265,11 @@ class RowModel:
         )
         sizes = torch.cat(
             [
-                prior.sizes[: prior.class_count],
-                prior.sizes.new_tensor([of_class.gravity_sigma, *of_class.series_sigmas]),
+                prior.group_scales[: prior.geometric_class_count],
+                prior.group_scales.new_tensor([of_class.gravity_sigma, *of_class.series_sigmas]),
             ]
         )
-        return replace(prior, sizes=sizes).precision.rsqrt()
+        return replace(prior, group_scales=sizes).precision.rsqrt()
 
 
 def _problem(robot: Robot, rows: Measurements) -> tuple[CalibrationSetup, Design]:

@@ -90,7 +90,9 @@ def _marks_of(marks: Mapping[str, Sequence[Mark]], chart: Chart) -> list[Mark]:
 
 def _sessions(records: Sequence[Record], refused: Sequence[tuple[str, str, str]]) -> Table:
     """Return a table of all sessions, with verdict and reason first; refused sessions have no error."""
-    said = [_sentence(" ".join((one.session.sentence, *one.session.unobservable))) for one in records]
+    said = [
+        _sentence(" ".join((one.session.sentence, *one.session.unobservable_sentences))) for one in records
+    ]
     rows: list[tuple[str, ...]] = [
         (date, verdict, line, error, count, pays, file)
         for (date, file, count, verdict, error, pays), line in zip(
@@ -186,16 +188,18 @@ def draw_statistics(chart: Chart, days: Sequence[datetime.date], marks: Sequence
     with drawing_style():
         figure, axes = make_panel()
         for share, name, color, line in (
-            (chart.ewma_of_limit, "EWMA", AFTER, "o-"),
-            (chart.cusum_of_limit, "CUSUM", OTHER, "s--"),
+            (chart.ewma_to_limit_ratio, "EWMA", AFTER, "o-"),
+            (chart.cusum_to_limit_ratio, "CUSUM", OTHER, "s--"),
         ):
             axes.plot(days, share.numpy(), line, color=color, label=name, markersize=3.5)  # type: ignore[arg-type]
         axes.axhline(1.0, color=BEFORE, linewidth=1.2, label="limit")
         _mark(axes, marks, days)
-        axes.set(ylabel="share of the limit", ylim=(min(0.0, float(chart.ewma_of_limit.min()) * 1.1), None))
+        axes.set(
+            ylabel="share of the limit", ylim=(min(0.0, float(chart.ewma_to_limit_ratio.min()) * 1.1), None)
+        )
         axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
         _dates(axes)
-    largest = float(np.maximum(chart.ewma_of_limit.numpy()[-1], chart.cusum_of_limit.numpy()[-1]))
+    largest = float(np.maximum(chart.ewma_to_limit_ratio.numpy()[-1], chart.cusum_to_limit_ratio.numpy()[-1]))
     alt = f"EWMA and CUSUM of {chart.quantity} over their limits; the larger is {largest:.2f} at the last session."
     return Drawing(f"{_key(chart)}_statistics", chart.quantity, alt, figure)
 
@@ -290,7 +294,7 @@ def comparison_page(
         models=models,
         robot=models[first].robot,
         parameters=difference_table(parameters, (first, second)),
-        differs=bool(parameters.differing),
+        differs=bool(parameters.significant_differences),
         level=f"{parameters.significance_level:.2g}",
         maps=[draw_displacement(what, one) for what, one in tool_displacements.items()],
         displacements=pose_rows({what: one.errors.figures for what, one in tool_displacements.items()}),

@@ -55,7 +55,7 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
-def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
+def write_intermediate_code(code: str, forms: KernelForms, **made_with: str) -> None:
     """Write the intermediate code of the current sources.
 
     Args:
@@ -81,13 +81,13 @@ def _write(file: Path, code: bytes, **stated: Any) -> None:
     file.write_bytes(header.encode() + b"\n" + lzma.compress(code, preset=9 | lzma.PRESET_EXTREME))
 
 
-def ready_forms() -> KernelForms | None:
+def stored_code_forms() -> KernelForms | None:
     """Return the forms that the stored code evaluates; None if it is missing or belongs to other sources."""
     header, _ = _content(FILE)
     return None if header is None else KernelForms(**{kind: tuple(n) for kind, n in header["forms"].items()})
 
 
-def read_ready() -> str | None:
+def read_intermediate_code() -> str | None:
     """Return the stored intermediate code; None if it is missing or damaged, or if the sources have changed."""
     header, code = _content(FILE)
     try:
@@ -187,5 +187,7 @@ def build() -> None:
     from importlib.metadata import version
 
     code = intermediate_code()
-    write_ready(code, KernelForms.registered(), numba=version("numba"), llvmlite=version("llvmlite"))
+    write_intermediate_code(
+        code, KernelForms.registered(), numba=version("numba"), llvmlite=version("llvmlite")
+    )
     print(f"{FILE}: {FILE.stat().st_size / 1e3:.0f} kB ({len(code) / 1e6:.1f} MB of text)")

@@ -26,7 +26,7 @@ def write_description(
     branches: Any,
     joints: Any,
     name: str,
-    belongs_to: str = "",
+    model_folder_hash: str = "",
     warnings: Any = (),
 ) -> None:
     """Write a description, names of branches, joints and model, and warnings, as `.npz`; see `CompiledIK`.
@@ -44,7 +44,7 @@ def write_description(
         "branches": branches,
         "joints": joints,
         "name": name,
-        "belongs_to": belongs_to,
+        "belongs_to": model_folder_hash,
         "warnings": warnings,
         "forms": dataclasses.asdict(description.forms),
         "shapes": shapes,

@@ -24,10 +24,10 @@ from pisigma.robot.kernels.build import (
     ARGUMENTS,
     ENTRY,
     intermediate_code,
+    read_intermediate_code,
     read_object,
-    read_ready,
-    ready_forms,
     source_hash,
+    stored_code_forms,
     write_object,
 )
 from pisigma.robot.kernels.forms import KernelForms
@@ -54,7 +54,7 @@ _kept: list[Any] = []
 
 @functools.cache
 def _ready_forms() -> KernelForms | None:
-    return ready_forms()
+    return stored_code_forms()
 
 
 _NOTHING = KernelForms()
@@ -120,7 +120,7 @@ def _runs_stored_code() -> bool:
 
 def build_object() -> None:
     """Compile the intermediate code in the package to machine code, and write it into the package."""
-    code = read_ready()
+    code = read_intermediate_code()
     assert code is not None, "the intermediate code is built first"
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -176,7 +176,7 @@ def _key(forms: KernelForms) -> str:
 
 def _intermediate_code(forms: KernelForms) -> str:
     """Return the code of the package if it has the current sources and forms, otherwise compile it with numba."""
-    ready = read_ready() if _ready_forms() == forms else None
+    ready = read_intermediate_code() if _ready_forms() == forms else None
     if ready is not None:
         return ready
     try:

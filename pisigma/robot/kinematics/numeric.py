@@ -132,7 +132,7 @@ def solve_numeric(
             _iterate(robot, task, T_flat, state, active)
             stalled = state.damping[active] > tolerances.MAX_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
-        return _finish(robot, state, tolerance, batch, task.rows)
+        return _finish(robot, state, tolerance, batch, task.used_axis_count)
 
 
 def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
@@ -183,7 +183,7 @@ class TaskMotion:
     weights: Float[Tensor, " 6"]
 
     @property
-    def rows(self) -> int:
+    def used_axis_count(self) -> int:
         """Number of task axes with a nonzero weight."""
         return int(self.weights.count_nonzero())
 
@@ -213,7 +213,9 @@ def _iterate(
 ) -> None:
     """Try one step for the active poses, and keep the steps that decrease the error."""
     old = _scaled(robot, state.error[active])
-    trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active], task.rows)
+    trial = state.q[active] + damped_step(
+        robot, state.J[active], old, state.damping[active], task.used_axis_count
+    )
     error, J = task.errors(T[active], trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1

@@ -82,7 +82,7 @@ class TaskAxes:
         )
 
     @property
-    def directions(self) -> tuple[bool, ...]:
+    def compared_directions(self) -> tuple[bool, ...]:
         """Tool axes whose directions measure the distance between poses; see `StoredStarts.nearest`."""
         counted = self.free.count(False) > 3
         return tuple(self.is_exact or (counted and k == self.pivot) for k in range(3))

@@ -17,7 +17,7 @@ from pisigma.files.output_folder import staged_folder
 from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.camera.board import Board, BoardDocument
-from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
+from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicDeviationsSection
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.measurement.camera.image_rows import Images, image_measurements
 from pisigma.measurement.dataset import Measurements
@@ -201,7 +201,7 @@ class SimulatedImages(Section):
     camera: CameraDocument
     board: BoardDocument
     noise: CornerNoise
-    camera_errors: IntrinsicsSection = IntrinsicsSection()
+    camera_errors: IntrinsicDeviationsSection = IntrinsicDeviationsSection()
     board_errors: BoardErrors = BoardErrors()
     late_joints: JointReadingDelay | None = None
 

@@ -96,7 +96,7 @@ def _largest_share(branch: Tensor) -> float:
 def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
     """Warn about intrinsics that are fixed, free, or far from their calibration."""
     identified = ImageIntrinsics.from_csv_cells(texts_of(images, INTRINSICS_COLUMN))
-    cells = zip(texts_of(images, CAMERA_COLUMN), identified.prior_mean, identified.sigma, strict=True)
+    cells = zip(texts_of(images, CAMERA_COLUMN), identified.prior_mean, identified.prior_sigma, strict=True)
     first = {camera: (stated, sigma) for camera, stated, sigma in reversed(list(cells)) if camera}
     for camera, (stated, sigma) in sorted(first.items()):
         if not sigma.any():
@@ -109,7 +109,7 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
             )
             continue
         free = sigma > 0
-        off = (result.unknowns["camera"][camera] - stated)[free] / sigma[free]
+        off = (result.sensor_unknowns["camera"][camera] - stated)[free] / sigma[free]
         if sigma[0] > _WIDE:
             yield _warning(
                 "intrinsics_free",

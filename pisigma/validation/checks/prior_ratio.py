@@ -69,12 +69,14 @@ def narrowest_robot_class(
         The class; None if no class allows these errors.
     """
     usual = checked.robot_class
-    sizes = [(ratio.group, ratio.size) for ratio in large_ratios]
-    at_least = [(ratio.group, ratio.size_at_least) for ratio in large_ratios]
+    sizes = [(ratio.group, ratio.error_sigma) for ratio in large_ratios]
+    at_least = [(ratio.group, ratio.error_sigma_lower_bound) for ratio in large_ratios]
     if usual.allows(at_least) or checked.calibrator.robot_class is not None:
         return usual if usual.allows(at_least) else None
     if any(
-        group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.max_sizes.size_of(group)
+        group != PriorGroup.JOINT_OFFSET
+        for group, size in at_least
+        if size > usual.max_error_sigmas.size_of(group)
     ):
         return None
     names = list(CLASSES)
@@ -106,7 +108,7 @@ def predicts_held_out_rows(checked: CheckedCalibration) -> bool:
 
 def _size(ratio: PriorRatio) -> str:
     unit = "mm" if ratio.kind == "length" else "mrad"
-    return f"{ratio.size * 1e3:.2g} {unit}"
+    return f"{ratio.error_sigma * 1e3:.2g} {unit}"
 
 
 def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | None, believed: bool) -> str:
@@ -148,7 +150,7 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if setup_diagnostics(checked.robot, checked.rows):
         return
     usual = checked.robot_class
-    far = usual.max_sizes.joint_offset if usual is SERVO else FAR
+    far = usual.max_error_sigmas.joint_offset if usual is SERVO else FAR
     directions = direction_by_zero_parameter(checked.robot)
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")

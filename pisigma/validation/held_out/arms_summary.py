@@ -147,22 +147,22 @@ def base_figures(
     names = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
     values = dict(zip(names, (xyz_zyx_from_transform(T).numpy() * shown).tolist(), strict=True))
     return ArmBaseFigures(
-        arm=bases.arms[second_arm].name,
-        other_arm=bases.arms[first_arm].name,
+        arm=bases.individual_posteriors[second_arm].name,
+        other_arm=bases.individual_posteriors[first_arm].name,
         standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
         covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
-        tool_to_tool_mm=bases.tool_to_tool_deviation(first_arm, second_arm, postures) * 1e3,
+        tool_to_tool_mm=bases.tool_to_tool_sigma(first_arm, second_arm, postures) * 1e3,
         **values,
     )
 
 
 def tip_figures(bases: ArmBases) -> tuple[TipFigures, ...]:
     """Return the tips that were found together with the bases."""
-    first, sizes = 6 * (len(bases.arms) - 1), [3] * len(bases.tips)
+    first, sizes = 6 * (len(bases.individual_posteriors) - 1), [3] * len(bases.tips)
     roots = torch.split(bases.conditioned.x_root[first:], sizes) if sizes else ()
     return tuple(
         TipFigures(
-            arm=bases.arms[number].name,
+            arm=bases.individual_posteriors[number].name,
             name=name,
             **dict(zip(("x_mm", "y_mm", "z_mm"), (position * 1e3).tolist(), strict=True)),
             standard_errors=tuple((root.norm(dim=1) * 1e3).tolist()),
@@ -173,7 +173,9 @@ def tip_figures(bases: ArmBases) -> tuple[TipFigures, ...]:
 
 def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diagnostic:
     """Return the finding that arms disagree on the location of a shared object."""
-    names = " and ".join(f"'{bases.arms[number].name}'" for number in disagreement.shared.arms)
+    names = " and ".join(
+        f"'{bases.individual_posteriors[number].name}'" for number in disagreement.shared.arms
+    )
     remedy = (
         "check the names and joint values of both rows, and that both tips were at rest"
         if disagreement.shared.kind == TOUCH
@@ -187,12 +189,12 @@ def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diag
         sentence=(
             f"Arms {names} place {disagreement.shared.kind} '{disagreement.shared.name}' "
             f"{disagreement.distance * 1e3:.3g} mm apart, which is improbable "
-            f"(probability {disagreement.probability:.1g}); {remedy}."
+            f"(probability {disagreement.p_value:.1g}); {remedy}."
         ),
         values={
             "name": disagreement.shared.name,
             "distance_mm": disagreement.distance * 1e3,
-            "probability": disagreement.probability,
+            "probability": disagreement.p_value,
         },
         remedy=remedy,
     )
@@ -200,7 +202,7 @@ def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diag
 
 def indeterminate_sum_sentences(arm: str, result: CalibrationResult) -> tuple[str, ...]:
     """Return a sentence for every direction of an arm's bases that is known only in a sum with tool parameters."""
-    in_a_sum = {one.name for one in result.parameters if one.label.startswith("in a sum")}
+    in_a_sum = {one.name for one in result.parameters if one.short_remark.startswith("in a sum")}
     return tuple(
         f"{one.names[0]} of arm '{arm}' is known only in a sum with {', '.join(one.names[1:])}; errors of these shift "
         "or turn its base relative to other arms, and the standard errors do not include them."
@@ -225,12 +227,12 @@ def arms_summary(
         postures: postures of every arm.
         indeterminate_sums: sentences of `indeterminate_sum_sentences` of all arms.
     """
-    names = [arm.name for arm in bases.arms]
+    names = [arm.name for arm in bases.individual_posteriors]
     count = len(names)
     return ArmsSummary(
         arms=tuple(
-            ArmModelFolder(name=arm.name, robot=robot, torso=arm.torso)
-            for arm, robot in zip(bases.arms, robots, strict=True)
+            ArmModelFolder(name=arm.name, robot=robot, torso=arm.torso_joints)
+            for arm, robot in zip(bases.individual_posteriors, robots, strict=True)
         ),
         bases=tuple(base_figures(bases, a, b, postures) for b in range(count) for a in range(b)),
         shared=tuple(
@@ -240,11 +242,11 @@ def arms_summary(
                 arms=tuple(names[number] for number in one.arms),
                 distance_mm=distance * 1e3,
             )
-            for one, distance in zip(bases.shared, bases.max_distances, strict=True)
+            for one, distance in zip(bases.shared, bases.largest_distances, strict=True)
         ),
         misfit=bases.conditioned.misfit,
-        degrees_of_freedom=bases.conditioned.redundancy,
-        misfit_probability=bases.probability,
+        degrees_of_freedom=bases.conditioned.degrees_of_freedom,
+        misfit_probability=bases.p_value,
         tips=tip_figures(bases),
         diagnostics=tuple(disagreement_diagnostic(bases, one) for one in bases.disagreements),
         indeterminate_sums=indeterminate_sums,

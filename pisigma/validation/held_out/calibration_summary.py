@@ -302,7 +302,7 @@ def _parameters(result: Result) -> tuple[ParameterFigures, ...]:
         unit, factor = SHOWN_UNITS[parameter.unit]
         names = ("nominal", "estimated", "change", "standard_error")
         figures = {name: _or_none(getattr(parameter, name) * factor) for name in names}
-        texts = {"name": parameter.name, "remark": parameter.remark, "label": parameter.label}
+        texts = {"name": parameter.name, "remark": parameter.remark, "label": parameter.short_remark}
         rows.append(ParameterFigures(unit=unit, **texts, **figures))
     return tuple(rows)
 
@@ -335,7 +335,7 @@ def _hybrid(result: HybridResult) -> JointCorrectionFigures:
             log_evidence=_or_none(trial.log_evidence),
             held_out_ratio=trial.held_out_ratio,
             seconds=round(trial.seconds, 3),
-            is_improvement=trial.kept,
+            is_improvement=trial.is_best_so_far,
         )
         for trial in result.trials
     )

@@ -144,7 +144,7 @@ def _cause_figures(cause: Cause) -> CauseFigures:
 def _rms(fit: FrameFit, quantity: Literal["m", "rad"]) -> float | None:
     """Return the RMS length of the residuals of all sensors of a quantity [m or rad]; None without such sensors."""
     sensors = [
-        one for one in fit.solved.result().noise if one.quantity == quantity and one.sensor != "corner"
+        one for one in fit.solved.result().noise if one.residual_unit == quantity and one.sensor != "corner"
     ]
     rows = sum(one.values / one.components for one in sensors)
     squares = sum(one.rms**2 * one.values / one.components for one in sensors)

@@ -160,10 +160,10 @@ class Hypothesis:
     @cached_property
     def error(self) -> float:
         """RMS error [m], corrected for the degrees of freedom."""
-        spare = self.measured.values - self.fitted_parameters
+        spare = self.measured.value_count - self.fitted_parameters
         if spare < _MIN_FREEDOM:
             return float("inf")
-        mean = float(self.measured.squared_errors(self.T).mean()) * self.measured.values / spare
+        mean = float(self.measured.squared_errors(self.T).mean()) * self.measured.value_count / spare
         return float(np.sqrt(mean)) if np.isfinite(mean) else float("inf")
 
     def rms(self) -> tuple[float, float]:

@@ -47,7 +47,7 @@ _LARGEST_ZERO = 0.1
 """Largest standard deviation of the zeros of revolute joints of industrial arms and cobots after a repair [rad]."""
 _MAX_ZEROS = 3.0
 """Ratio of the largest plausible error of a single zero to `largest_zero_sigma`."""
-_MAX_SLIDE = 3 * HOBBY.max_sizes.length
+_MAX_SLIDE = 3 * HOBBY.max_error_sigmas.length
 """Largest plausible error of the zero of a prismatic joint [m]."""
 _USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
@@ -67,7 +67,7 @@ _MAX_CLUSTERINGS = 8
 
 def largest_zero_sigma(robot: Robot) -> float:
     """Return the largest standard deviation [rad] of revolute joint zeros in this manufacturer's class of robots."""
-    return max(_LARGEST_ZERO, RobotClass.from_robot(robot).max_sizes.joint_offset)
+    return max(_LARGEST_ZERO, RobotClass.from_robot(robot).max_error_sigmas.joint_offset)
 
 
 def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:

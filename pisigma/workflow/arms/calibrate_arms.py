@@ -173,7 +173,7 @@ def posterior_of(arm: Arm, calibration: Calibration, torso: tuple[str, ...]) -> 
     """
     known = calibration.model.uncertainty or uncertainty_of(geometric_result(calibration.result))
     if arm.touches is None:
-        return ArmPosterior(arm.name, known, torso=torso)
+        return ArmPosterior(arm.name, known, torso_joints=torso)
     rows = read_rows(arm.touches, calibration.model.robot)
     for column, stated in (
         ("socket", rows.is_measured("socket")),

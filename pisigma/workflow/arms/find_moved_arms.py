@@ -104,7 +104,7 @@ class ArmsMovement:
         return {
             "seconds": round(self.seconds, 3),
             "summary": self.sentence,
-            "probability": self.moved_bases.probability,
+            "probability": self.moved_bases.p_value,
             "is_one_body": self.moved_bases.is_one_body,
             "bodies": [one.model_dump(mode="json") for one in self.bodies],
         }
@@ -182,7 +182,7 @@ def _arm(
         )
     rows = read_rows(data, model.robot, cameras)
     return RemeasuredArm(
-        ArmPosterior(name, model.uncertainty, torso=stated.torso),
+        ArmPosterior(name, model.uncertainty, torso_joints=stated.torso),
         T_first_base,
         frames_of_model(model, rows, "base"),
     )

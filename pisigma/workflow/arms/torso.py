@@ -99,9 +99,9 @@ def with_common_joints(calibration: Calibration, posterior: ArmPosterior) -> Cal
     updated = replace(result, geometric=common) if isinstance(result, HybridResult) else common
     robot = model.robot.with_geometry(base=geometry.robot.base, tool=geometry.robot.tool)
     text = (
-        f"{calibration.card_texts.description} Arms of one torso share its base and {', '.join(posterior.torso)}: "
-        "their values are from the rows of all these arms, held-out errors and standard errors in tables from the "
-        "rows of this arm only. There is no joint correction."
+        f"{calibration.card_texts.description} Arms of one torso share its base and "
+        f"{', '.join(posterior.torso_joints)}: their values are from the rows of all these arms, "
+        "held-out errors and standard errors in tables from the rows of this arm only. There is no joint correction."
     )
     summary = calibration.summary.with_figures(parameters=summarise(updated).parameters)
     return replace(

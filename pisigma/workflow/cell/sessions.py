@@ -312,7 +312,7 @@ class Sessions:
         last = max(rows.date or (session.day,))
         changes: list[tuple[str, str]] = [(one.day, one.kind) for one in self.history.events()]
         changes += [
-            (one.day, "controller") for one in ControllerHistory.from_history(self.history).zero_changes
+            (one.day, "controller") for one in ControllerHistory.from_history(self.history).joint_zero_changes
         ]
         if spanned := [kind for day, kind in changes if session.day < day <= last]:
             raise MeasurementError(

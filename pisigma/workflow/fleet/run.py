@@ -62,10 +62,10 @@ def advance_cell(
     done: set[str] = set()
     while True:
         step = next_step(replace(facts_of(cell.folder), unrecorded_files=()))
-        if step.verb is not None and step.command not in done:
+        if step.automatic_command is not None and step.command not in done:
             done.add(step.command)
-            progress(step.verb)
-            _take(cell, step.verb, shlex.split(step.command)[3:], prior)
+            progress(step.automatic_command)
+            _take(cell, step.automatic_command, shlex.split(step.command)[3:], prior)
         elif not cell.sessions.add_next_file():
             return status_of(cell.folder)
         else:
@@ -250,7 +250,7 @@ def run_fleet(
     reasons = dict(before.unreadable) | {
         one.name: one.step.reason for one in before.cells if one.step.state in ATTENTION
     }
-    due = {one.name for one in before.cells if one.is_due}
+    due = {one.name for one in before.cells if one.has_automatic_step}
     waiting = [cell for cell in cells if cell.name in due]
     parameters = dict(read_parameters(path))
     work = functools.partial(_advance, prior=settings.prior)

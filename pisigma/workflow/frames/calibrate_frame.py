@@ -107,7 +107,7 @@ def calibrate_frame(
     diagnostics = check_rows_of_frames(rows, arm if model is None else model, found)
     warnings = (one.sentence for one in diagnostics if one.severity == "warning")
     summary = frame_calibration_summary(
-        found.fit, found.arm_variance, found.causes, parent, (*row_warnings(arm, rows), *warnings)
+        found.fit, found.variance_due_to_arm, found.causes, parent, (*row_warnings(arm, rows), *warnings)
     )
     summary = summary.with_figures(
         command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})",

@@ -79,7 +79,11 @@ def fitted_together(seed: int, sensor: str) -> OptimizeResult:
     )
     found = fit_arm_bases(arms).T_first_base[1].numpy()
     there = FRAMES if sensor in ("frames", "touches") else {}
-    where = [fits[0].unknowns["socket"][f"plate/{k}"] for k in range(SOCKETS)] if sensor == "sockets" else []
+    where = (
+        [fits[0].sensor_unknowns["socket"][f"plate/{k}"] for k in range(SOCKETS)]
+        if sensor == "sockets"
+        else []
+    )
     start = np.concatenate([guess, np.zeros(6), np.zeros(6 * len(there)), *where])
 
     touching = [touching_rows(number, seed).q for number in (0, 1)] if sensor == "touches" else []
@@ -134,7 +138,10 @@ def test_posterior_is_that_of_one_fit_of_all_rows(sensor):
         for fit in own_fits(0, sensor)
     )
     assert_close(found.conditioned.misfit, misfit, rtol=0.02)
-    assert found.conditioned.redundancy == {"frames": 6, "sockets": 3 * SOCKETS - 6, "touches": 54}[sensor]
+    assert (
+        found.conditioned.degrees_of_freedom
+        == {"frames": 6, "sockets": 3 * SOCKETS - 6, "touches": 54}[sensor]
+    )
 
 
 @pytest.mark.parametrize("sensor", ["hall", "sockets"])
@@ -180,7 +187,7 @@ def test_vector_between_the_tools_is_known_as_stated():
         ]
         between = np.array(tools[2]) - tools[0] - (np.array(tools[3]) - tools[1])
         errors.append(np.square(between).sum(1).mean())
-        stated.append(found.tool_to_tool_deviation(0, 1, postures) ** 2)
+        stated.append(found.tool_to_tool_sigma(0, 1, postures) ** 2)
     assert_close(np.sqrt(np.mean(errors) / np.mean(stated)), 1.0, atol=0.25)
 
 
@@ -205,7 +212,7 @@ def test_arms_without_anything_in_common_are_refused():
 
 def test_frame_with_an_undetermined_direction_is_not_shared():
     left, right = posteriors(1, "hall")
-    rows = list(right.base_rows("hall"))
+    rows = list(right.base_indices("hall"))
     root = right.covariance_root.clone()
     direction = torch.tensor([0.6, 0.8, 0, 0, 0, 0], dtype=torch.float64)
     root[rows] -= direction[:, None] * (direction @ root[rows])
@@ -230,7 +237,7 @@ def test_arms_that_touch_are_connected(tip):
         error = pose_error(pose_of(BASES[1]), T)
         scores.append(float(error @ torch.linalg.solve(covariance, error)))
         assert found.disagreements == ()
-        assert found.conditioned.redundancy == 20 * 3 - (12 if tip else 6)
+        assert found.conditioned.degrees_of_freedom == 20 * 3 - (12 if tip else 6)
         for position in found.tips.values():
             assert_close(position, torch.from_numpy(TIP[:3]), atol=5e-4)
     assert np.sum(scores) < 43  # 99 % of chi-squared with 24 degrees

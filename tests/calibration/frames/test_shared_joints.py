@@ -21,7 +21,7 @@ def fitted(folder, seed: int, joints: int, zeros: tuple[float, float] = (0.0, 0.
     rows = [measured_rows(robot, 10 * seed + k) for k, robot in enumerate(true)]
     fits = [own_fit(*one) for one in zip(nominal, rows, strict=True)]
     arms = [
-        ArmPosterior(name, uncertainty_of(fit), torso=TORSO[:joints])
+        ArmPosterior(name, uncertainty_of(fit), torso_joints=TORSO[:joints])
         for name, fit in zip(ARMS, fits, strict=True)
     ]
     return true, rows, fits, fit_arm_bases(arms)
@@ -32,14 +32,16 @@ def test_arms_have_one_base_and_equal_parameters_of_the_shared_joints(tmp_path, 
     true, rows, _, found = fitted(tmp_path, 0, joints)
     left, right = found.updated_arms
     assert [one.key for one in found.shared][:joints] == [("joint", name) for name in TORSO[:joints]]
-    assert found.conditioned.redundancy == 4 * joints
+    assert found.conditioned.degrees_of_freedom == 4 * joints
     assert found.disagreements == ()
     shared = 5 * (joints - 1)
     assert_close(left.values[:shared], right.values[:shared], atol=1e-12)
     assert_close(left.covariance_root[:shared], right.covariance_root[:shared], atol=1e-12)
-    base = list(left.base_rows("hall"))
-    assert_close(left.values[base], right.values[list(right.base_rows("hall"))], atol=1e-9)
-    assert_close(left.covariance_root[base], right.covariance_root[list(right.base_rows("hall"))], atol=1e-9)
+    base = list(left.base_indices("hall"))
+    assert_close(left.values[base], right.values[list(right.base_indices("hall"))], atol=1e-9)
+    assert_close(
+        left.covariance_root[base], right.covariance_root[list(right.base_indices("hall"))], atol=1e-9
+    )
     T, covariance = found.relative(0, 1)
     assert_close(T, np.eye(4), atol=1e-12)
     assert_close(covariance, np.zeros((6, 6)), atol=1e-18)
@@ -78,7 +80,9 @@ def test_errors_of_both_tools_are_those_of_one_fit_of_all_rows(tmp_path, joints)
     bound = bound_of_tools(true, rows, fits, [one.q for one in few], joints)
     stated = [arm.uncertainty.sigma(one).numpy() for arm, one in zip(found.updated_arms, few, strict=True)]
     assert_close(np.array(stated) / bound, 1.0, atol=0.02)
-    alone = [arm.uncertainty.sigma(one).numpy() for arm, one in zip(found.arms, few, strict=True)]
+    alone = [
+        arm.uncertainty.sigma(one).numpy() for arm, one in zip(found.individual_posteriors, few, strict=True)
+    ]
     assert float(np.mean(stated) / np.mean(alone)) < 0.98
 
 

@@ -147,4 +147,4 @@ def test_parallel_axes_leave_the_tool_at_its_nominal_height_and_the_base_in_sums
     by_name = {one.name: one for one in result.parameters}
     for name, value in zip(("base_x", "base_y", "base_z"), tilted, strict=False):
         assert abs(by_name[name].estimated - value) > 1e-3
-        assert by_name[name].label == "in a sum"
+        assert by_name[name].short_remark == "in a sum"

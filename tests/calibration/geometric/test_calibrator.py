@@ -213,7 +213,7 @@ def test_undetermined_parameters_remain_nominal_and_are_reported() -> None:
     assert len(result.weak_directions) == 2
     assert all("theta_5" in sentence or "alpha_5" in sentence for sentence in result.weak_directions)
     assert "target_on_axis" in [warning.kind for warning in result.warning_details]
-    assert "prior" in result.parameter("alpha_5").label
+    assert "prior" in result.parameter("alpha_5").short_remark
     assert (
         result.redundancy.dependency_sentence_of("d_2")
         == "d_2 + d_3 + d_4 is identified; the individual values are not"

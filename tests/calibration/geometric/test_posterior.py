@@ -41,11 +41,11 @@ def test_sensors_unknowns_are_among_them(result: CalibrationResult) -> None:
     some = posterior.select([*names, "a_2", "base_x"] if "base_x" in posterior.names else [*names, "a_2"])
     group, owner = next(
         (group, owner)
-        for group, owners in result.unknowns.items()
+        for group, owners in result.sensor_unknowns.items()
         for owner in owners
         if names[0] == f"{group}_{owner}_x"
     )
-    assert_close(some.mean[:3], torch.from_numpy(result.unknowns[group][owner][:3]))
+    assert_close(some.mean[:3], torch.from_numpy(result.sensor_unknowns[group][owner][:3]))
     rows = [posterior.names.index(name) for name in some.names]
     # products of other numbers of rows may be summed in another order, which shows in the last bit
     whole = posterior.covariance[rows][:, rows]

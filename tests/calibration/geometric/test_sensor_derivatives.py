@@ -118,7 +118,7 @@ def test_exact_data_of_every_sensor_give_the_robot_back(kind: str) -> None:
         assert_close(errors[seen], torch.zeros_like(errors[seen]), atol=1e-11)
     assert_close(result.robot.dh, arm.geometric_robot.dh, atol=1e-7)
     if kind in ("distance", "mixed"):
-        assert_close(result.unknowns["anchor"]["wire"][3], 0.012, atol=1e-7)
+        assert_close(result.sensor_unknowns["anchor"]["wire"][3], 0.012, atol=1e-7)
 
 
 def test_pairs_in_any_order_and_many_rows_stay_together() -> None:

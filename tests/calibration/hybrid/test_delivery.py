@@ -40,8 +40,8 @@ def test_errors_of_a_sensor_are_compared_by_groups():
     better = SensorErrors(group, small, small, torch.ones_like(small))
     assert not better.compare(before).is_worse
     assert better.compare(before).held_out_ratio == pytest.approx(1 / 3)
-    assert better.compare(before).gain > 3
+    assert better.compare(before).gain_in_standard_errors > 3
     assert before.compare(better).is_worse
-    assert before.compare(better).gain < -3
+    assert before.compare(better).gain_in_standard_errors < -3
     fitted_better = SensorErrors(group, small, 4 * small, torch.ones_like(small))
     assert fitted_better.compare(before).is_worse

@@ -77,9 +77,9 @@ def test_a_prior_starts_from_the_sizes_that_another_design_came_to(arm: Linearis
     small = Design(problem, (FourierSeries(robot, 2), ScaledJoints(robot)))
     large = Design(problem, (GravityTorques(robot), ScaledJoints(robot), FourierSeries(robot, 4)))
     sizes = torch.tensor([0.5, 2.0, 1.0, 3.0, 1e-4, 2e-4, 5e-4], dtype=torch.float64)
-    found = large.prior_with_sizes_of(small, replace(small.prior((1.0,) * 4), sizes=sizes))
+    found = large.prior_with_scales_of(small, replace(small.prior((1.0,) * 4), group_scales=sizes))
     expected = [0.5, 2.0, 1.0, 3.0, FIRST_SIZE, 5e-4, 1e-4, 2e-4, 2e-4, 2e-4]
-    assert_close(found.sizes, torch.tensor(expected, dtype=torch.float64), rtol=1e-7)
+    assert_close(found.group_scales, torch.tensor(expected, dtype=torch.float64), rtol=1e-7)
     assert_close(found.unit_precision, large.prior((1.0,) * 4).unit_precision)
 
 
@@ -102,10 +102,12 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
     robot, problem = arm.rows.problem.space.robot, arm.rows.problem
     design = Design(problem, features(robot, 3))
     prior = design.prior((0.5, 2.0, 1.0, 3.0))
-    assert prior.class_count == 4
-    assert_close(prior.sizes, torch.tensor([0.5, 2.0, 1.0, 3.0, *[FIRST_SIZE] * 5]).double(), rtol=1e-7)
+    assert prior.geometric_class_count == 4
+    assert_close(
+        prior.group_scales, torch.tensor([0.5, 2.0, 1.0, 3.0, *[FIRST_SIZE] * 5]).double(), rtol=1e-7
+    )
     active = slice(0, design.active_count)
-    expected = problem.precision[problem.active] / prior.sizes[problem.prior_group].square()
+    expected = problem.precision[problem.active] / prior.group_scales[problem.prior_group].square()
     assert_close(prior.precision[active], expected, rtol=1e-14)
     assert prior.group[design.weights_of(0)].unique().tolist() == [4]
     assert prior.group[design.weights_of(1)].unique().tolist() == [5]

@@ -98,12 +98,12 @@ def test_log_evidence_is_stationary_in_sizes_and_noise(seed: int) -> None:
     found = fit.maximise_evidence(prior(), NOISE, iterations=500, tolerance=0.0)
 
     def evidence(log_change: Tensor) -> float:
-        sizes = found.prior.sizes * log_change[:3].exp()
+        sizes = found.prior.group_scales * log_change[:3].exp()
         noise = tuple(
             sigma * math.exp(change)
             for sigma, change in zip(found.noise, log_change[3:].tolist(), strict=True)
         )
-        return fit.solve(replace(found.prior, sizes=sizes), noise).log_evidence
+        return fit.solve(replace(found.prior, group_scales=sizes), noise).log_evidence
 
     step = 1e-4
     slopes = []
@@ -120,18 +120,22 @@ def test_log_evidence_of_linearised_rows_is_stationary() -> None:
     case = poses()
     fit = NormalEquations.from_rows(case.design, case.rows)
     found = fit.maximise_evidence(case.prior, case.noise, 300, 1e-9)
-    moving = (found.prior.sizes > 10 * SMALLEST_SIZE).nonzero()[found.prior.class_count :, 0].tolist()
+    moving = (
+        (found.prior.group_scales > 10 * SMALLEST_SIZE)
+        .nonzero()[found.prior.geometric_class_count :, 0]
+        .tolist()
+    )
     assert moving
     step, slopes = 1e-3, []
     for number in [*moving, -1, -2]:
         ends = []
         for sign in (1, -1):
-            sizes, noise = found.prior.sizes.clone(), list(found.noise)
+            sizes, noise = found.prior.group_scales.clone(), list(found.noise)
             if number < 0:
                 noise[number] *= math.exp(sign * step)
             else:
                 sizes[number] *= math.exp(sign * step)
-            ends.append(fit.solve(replace(found.prior, sizes=sizes), tuple(noise)).log_evidence)
+            ends.append(fit.solve(replace(found.prior, group_scales=sizes), tuple(noise)).log_evidence)
         slopes.append((ends[0] - ends[1]) / (2 * step))
     assert_close(np.array(slopes), 0.0, atol=1e-2)
 
@@ -149,7 +153,7 @@ def test_more_updates_never_worsen_a_converged_search() -> None:
 def test_no_updates_are_the_posterior_as_it_is() -> None:
     fit = DenseRegression.between(*problem())
     found = fit.maximise_evidence(prior(), NOISE, 0)
-    assert_close(found.prior.sizes, prior().sizes)
+    assert_close(found.prior.group_scales, prior().group_scales)
     assert found.noise == NOISE
     assert found.log_evidence == fit.solve(prior(), NOISE).log_evidence
 
@@ -163,8 +167,8 @@ def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
     noise = noise - X @ torch.linalg.lstsq(X, noise).solution
     y = X[:, ~quiet] @ normal(int((~quiet).sum()), seed=2) + 0.1 * noise
     found = DenseRegression.between([X], [y]).maximise_evidence(prior(), (0.5,), 100, 0.0)
-    assert_close(found.prior.sizes[2], SMALLEST_SIZE, rtol=1e-6)
-    assert float(found.prior.sizes[:2].min()) > 0.1
+    assert_close(found.prior.group_scales[2], SMALLEST_SIZE, rtol=1e-6)
+    assert float(found.prior.group_scales[:2].min()) > 0.1
     assert_close(found.x[quiet], torch.zeros(3), atol=1e-12)
     assert_close(found.noise[0], float(y.sub(X @ found.x).norm()) / math.sqrt(200 - 5), rtol=1e-3)
 
@@ -172,16 +176,16 @@ def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
 def test_sizes_of_classes_of_geometric_parameters_are_kept() -> None:
     """The geometric calibration has found them; those of the weights move."""
     X, y = problem()
-    found = DenseRegression.between(X, y).maximise_evidence(prior(classes=2), NOISE).prior.sizes
-    assert_close(found[:2], prior().sizes[:2])
-    assert float((found[2] / prior().sizes[2]).log().abs()) > 1e-3
+    found = DenseRegression.between(X, y).maximise_evidence(prior(classes=2), NOISE).prior.group_scales
+    assert_close(found[:2], prior().group_scales[:2])
+    assert float((found[2] / prior().group_scales[2]).log().abs()) > 1e-3
 
 
 def test_sizes_that_no_data_determine_are_kept() -> None:
     X, y = problem()
     X = [columns * (GROUP != 1) for columns in X]
     found = DenseRegression.between(X, y).maximise_evidence(prior(), NOISE, 30, 0.0)
-    assert float(found.prior.sizes[1]) == 1.5
+    assert float(found.prior.group_scales[1]) == 1.5
     assert_close(found.x[GROUP == 1], torch.zeros(3))
 
 
@@ -216,6 +220,6 @@ def test_share_of_the_values_that_are_used_up_counts_what_is_measured() -> None:
     X, y = problem()
     fit = DenseRegression.between(X, y)
     posterior = fit.solve(prior(), NOISE)
-    assert_close(fit.effective_share(posterior), posterior.effective_unknowns / 45, rtol=1e-12)
+    assert_close(fit.absorbed_share(posterior), posterior.effective_unknowns / 45, rtol=1e-12)
     known = DenseRegression.between(X, y, exact=(False, True))
-    assert_close(known.effective_share(posterior), posterior.effective_unknowns / 30, rtol=1e-12)
+    assert_close(known.absorbed_share(posterior), posterior.effective_unknowns / 30, rtol=1e-12)

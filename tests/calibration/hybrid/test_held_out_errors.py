@@ -27,7 +27,7 @@ def test_closed_form_equals_fitting_without_every_group(name: str, form: str) ->
     assert found.sensor.tolist() == expected.sensor.tolist()
     assert len(found.error) >= len(case.folds)
     assert_close(found.error, expected.error, atol=1e-4 if name == "all kinds" else 1e-6)
-    assert_close(found.spread, expected.spread, rtol=1e-4 if name == "all kinds" else 1e-6)
+    assert_close(found.predicted_sigma, expected.predicted_sigma, rtol=1e-4 if name == "all kinds" else 1e-6)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -39,7 +39,7 @@ def test_several_groups_can_be_held_out_together(form: str) -> None:
     found = fit.held_out_errors(fit.solve(case.prior, case.noise), folds)
     expected = case.dense.held_out_errors(case.dense.solve(case.prior, case.noise), folds)
     assert_close(found.error, expected.error, atol=1e-6)
-    assert_close(found.spread, expected.spread, rtol=1e-6)
+    assert_close(found.predicted_sigma, expected.predicted_sigma, rtol=1e-6)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -50,7 +50,7 @@ def test_sizes_and_noise_can_be_estimated_for_every_fold(form: str) -> None:
     found = fit.held_out_errors_refitted(fit.solve(case.prior, case.noise), folds, 3)
     expected = case.dense.held_out_errors_refitted(case.dense.solve(case.prior, case.noise), folds, 3)
     assert_close(found.error, expected.error, atol=1e-4)
-    assert_close(found.spread, expected.spread, rtol=1e-4)
+    assert_close(found.predicted_sigma, expected.predicted_sigma, rtol=1e-4)
     held = fit.held_out_errors(fit.solve(case.prior, case.noise), folds)
     assert float((held.error - found.error).abs().max()) > 1e-2
 
@@ -77,8 +77,8 @@ def test_errors_are_larger_than_the_residuals_and_about_as_large_as_predicted() 
     found = fit.held_out_errors(posterior, case.folds)
     residual = sum(m / sigma**2 for m, sigma in zip(posterior.misfit, posterior.noise, strict=True))
     assert float(found.error.square().sum()) > residual
-    assert float(found.spread.min()) >= 1.0
-    assert 0.5 < float((found.error / found.spread).square().mean()) < 2.0
+    assert float(found.predicted_sigma.min()) >= 1.0
+    assert 0.5 < float((found.error / found.predicted_sigma).square().mean()) < 2.0
 
 
 def test_placements_of_sockets_and_anchors_are_among_what_is_held_out() -> None:
@@ -110,7 +110,7 @@ def test_parameters_determined_only_by_held_out_values_are_treated_as_fitted() -
     assert_close(found.error, expected, atol=1e-9)
     free = torch.eye(8).double() - Z @ torch.linalg.pinv(Z)
     spread = (free @ S @ free).diagonal().clamp(min=1.0).sqrt()
-    assert_close(found.spread, spread, rtol=1e-9)
+    assert_close(found.predicted_sigma, spread, rtol=1e-9)
 
 
 def test_downweighted_values_have_larger_errors_than_their_weight() -> None:
@@ -124,10 +124,12 @@ def test_downweighted_values_have_larger_errors_than_their_weight() -> None:
     )
     found = HeldOutErrors.from_fit(M, M @ y, sensor, counts)
     assert_close(alone.error, y, atol=1e-12)
-    assert_close(alone.spread, S.diagonal().sqrt(), rtol=1e-12)
+    assert_close(alone.predicted_sigma, S.diagonal().sqrt(), rtol=1e-12)
     assert_close(found.error[:3], alone.error[:3])
     assert_close(found.error[3:], 3**0.5 * alone.error[3:], rtol=1e-12)
-    assert_close(found.spread[3:].square() - 1, 3 * (alone.spread[3:].square() - 1), rtol=1e-12)
+    assert_close(
+        found.predicted_sigma[3:].square() - 1, 3 * (alone.predicted_sigma[3:].square() - 1), rtol=1e-12
+    )
 
 
 def test_root_mean_square_can_be_counted_in_another_noise() -> None:

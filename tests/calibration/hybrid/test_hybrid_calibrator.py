@@ -64,7 +64,7 @@ def test_all_errors_of_a_simulated_robot_are_learned_from_150_positions() -> Non
     assert 0.5 * NOISE < result.learned.noise["position"] < 1.5 * NOISE
     assert 0 < result.learned.effective_unknowns < result.learned.unknowns
     assert result.learned.rounds >= 1
-    assert any(trial.kept for trial in result.trials[1:])
+    assert any(trial.is_best_so_far for trial in result.trials[1:])
     assert "gravity" in [feature.name for feature in result.learned.correction.features]
 
 
@@ -89,14 +89,14 @@ def test_errors_of_geometry_alone_leave_the_geometric_calibration_as_it_is() -> 
     assert_close(
         result.errors_of(simulated.test)["position"], alone.errors_of(simulated.test)["position"], atol=1e-12
     )
-    assert next(trial.kept for trial in result.trials)
-    assert not any(trial.kept for trial in result.trials[1:])
+    assert next(trial.is_best_so_far for trial in result.trials)
+    assert not any(trial.is_best_so_far for trial in result.trials[1:])
 
 
 def test_a_kept_correction_is_in_the_table_of_what_was_tried() -> None:
     _, result = fitted()
     assert [trial.name for trial in result.trials[:2]] == ["geometry", "gravity"]
-    kept = [trial for trial in result.trials if trial.kept]
+    kept = [trial for trial in result.trials if trial.is_best_so_far]
     assert kept[0].held_out_ratio == 1.0
     assert kept[-1].held_out_ratio < 0.5
     assert all(b.log_evidence > a.log_evidence for a, b in itertools.pairwise(kept))
@@ -164,7 +164,7 @@ def test_product_units_without_an_effect_are_dropped() -> None:
     assert result.learned is not None
     assert result.learned.correction.orders == ()
     tried = [trial for trial in result.trials if "products" in trial.name]
-    assert not any(trial.kept for trial in tried)
+    assert not any(trial.is_best_so_far for trial in tried)
 
 
 def test_repeats_of_a_few_poses_do_not_fool_it() -> None:
@@ -338,7 +338,11 @@ def test_a_single_joint_is_calibrated_without_products(rows: int, tmp_path: Path
 def test_standard_errors_include_the_bias_from_gears():
     def ratio(result: HybridResult | CalibrationResult) -> float:
         of_arm = zip(result.parameters, common_errors().flatten().tolist(), strict=False)
-        z = [(one.change - true) / one.standard_error for one, true in of_arm if one.label == "identified"]
+        z = [
+            (one.change - true) / one.standard_error
+            for one, true in of_arm
+            if one.short_remark == "identified"
+        ]
         return float(np.sqrt(np.mean(np.square(z))))
 
     results = [HybridCalibrator(FLEET_ROBOT).fit(rows_of(k, 60, k, individual=0.0)) for k in (1, 3)]

@@ -46,7 +46,7 @@ def test_the_cases_are_what_they_are_for() -> None:
     """Sensors with one row, with two sides and with rows that count differently; columns that are not used."""
     values = {one.name: one for one in CASES["all kinds"]().rows.values}
     assert len(values["socket distance"].row) == 1
-    assert values["socket distance"].is_stated
+    assert values["socket distance"].are_values_given
     assert len(values["pair"].row_derivatives) == 2
     assert len(poses().rows.values[0].weight_root.unique()) > 20
     assert not bool(poses().design.features[1].used.all())
@@ -121,7 +121,7 @@ def test_equal_columns_without_a_prior_are_still_solved() -> None:
         poses().prior,
         unit_precision=torch.zeros(6).double(),
         group=torch.zeros(6, dtype=torch.int64),
-        sizes=torch.ones(1).double(),
+        group_scales=torch.ones(1).double(),
     )
     x = with_sums(twice.t() @ twice, twice.t() @ y).solve(flat, (1.0,)).x
     assert_close(twice @ x, X @ torch.linalg.lstsq(X, y).solution, atol=1e-5)
@@ -148,8 +148,8 @@ def test_initial_sizes_nearly_reach_the_gain_of_the_whole_fit() -> None:
     gain, sizes = largest.evidence_gain(before, design, products)
     assert sizes is not None
     assert len(sizes) == robot.dof
-    held = largest.design.prior_with_sizes_of(design, before.prior)
-    held = replace(held, sizes=torch.cat([before.prior.sizes, sizes]))
+    held = largest.design.prior_with_scales_of(design, before.prior)
+    held = replace(held, group_scales=torch.cat([before.prior.group_scales, sizes]))
     there = largest.solve(held, before.noise)
     assert_close(gain, there.log_evidence - before.log_evidence, atol=1e-3)
     full = largest.maximise_evidence(held, before.noise, 400, 1e-6).log_evidence - before.log_evidence

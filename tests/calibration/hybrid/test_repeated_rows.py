@@ -165,7 +165,7 @@ def test_targets_with_independent_errors_have_full_weight() -> None:
 
 def test_exact_values_pairs_and_single_targets_have_full_weight() -> None:
     copies, configuration = alike(3), torch.arange(8).repeat_interleave(3)
-    certain = replace(copies, is_stated=True)
+    certain = replace(copies, are_values_given=True)
     assert certain.downweight_correlated(configuration) is certain
     pair = replace(copies, other_row=copies.row, other_joint_derivatives=copies.joint_derivatives)
     assert pair.downweight_correlated(configuration) is pair

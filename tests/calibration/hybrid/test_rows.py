@@ -36,7 +36,9 @@ def test_rows_of_a_group_are_never_parted(arm: LinearisedArm) -> None:
 
 
 def test_what_is_certain_is_not_held_out(arm: LinearisedArm) -> None:
-    certain = replace(arm.rows, values=(arm.rows.values[0], replace(arm.rows.values[1], is_stated=True)))
+    certain = replace(
+        arm.rows, values=(arm.rows.values[0], replace(arm.rows.values[1], are_values_given=True))
+    )
     groups = torch.tensor([3, 4, 20])
     position, rotation = certain.held_out_rows(groups).values
     assert_close(position.residual, certain.select_groups(groups).values[0].residual)
@@ -107,7 +109,7 @@ def test_far_off_rows_count_less_and_squared_loss_counts_all_alike(arm: Linearis
     residual[7] += 5e-3
     values = (
         replace(first, residual=residual, weight_root=torch.ones(40).double()),
-        replace(second, is_stated=True),
+        replace(second, are_values_given=True),
     )
     robust, certain = robust_weights(replace(problem, loss=HampelLoss()), values, 20.0)
     assert float(robust[7]) == 0.0

@@ -52,11 +52,11 @@ def products() -> LinearisedArm:
 def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
     search = search_of(series)
     (line,) = search.trials
-    assert (line.name, line.held_out_ratio, line.kept) == ("geometry", 1.0, True)
-    assert search.geometry.name == "geometry"
-    assert line.unknowns == search.geometry.design.active_count
+    assert (line.name, line.held_out_ratio, line.is_best_so_far) == ("geometry", 1.0, True)
+    assert search.fit_without_features.name == "geometry"
+    assert line.unknowns == search.fit_without_features.design.active_count
     alone = series.fitted(())
-    assert_close(search.geometry.posterior.log_evidence, alone.posterior.log_evidence, atol=0.5)
+    assert_close(search.fit_without_features.posterior.log_evidence, alone.posterior.log_evidence, atol=0.5)
 
 
 def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(series: LinearisedArm) -> None:
@@ -64,7 +64,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
     search = search_of(series, said)
     best = search.select_features(SERIES, [SMALL], [PRODUCTS])
     assert best.name.endswith("series 4")
-    kept = [line for line in search.trials if line.kept]
+    kept = [line for line in search.trials if line.is_best_so_far]
     assert kept[-1].name == best.name
     assert kept[-1].held_out_ratio < 0.4
     assert all(b.log_evidence > a.log_evidence + CLEAR_EVIDENCE for a, b in itertools.pairwise(kept))
@@ -75,7 +75,7 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
     search = search_of(products)
     best = search.select_features(SERIES[:1], [SMALL], [PRODUCTS])
     assert best.name.endswith("products")
-    assert search.trials[-1].kept
+    assert search.trials[-1].is_best_so_far
     assert search.trials[-1].held_out_ratio < 0.6
     moved = best.design.correction(best.posterior.x, search.rows.problem.state)[:, 1]
     q = search.rows.problem.q
@@ -95,9 +95,9 @@ def test_products_have_to_gain_more_than_the_scatter(products: LinearisedArm, mo
     kept = search_of(products).select_features(SERIES[:1], [SMALL], [PRODUCTS])
     search = search_of(products)
     without = search.select_features(SERIES[:1], [SMALL])
-    gain = kept.gain(without)
+    gain = kept.gain_in_standard_errors(without)
     assert gain > CLEAR_GAIN
-    assert without.gain(kept) < -CLEAR_GAIN
+    assert without.gain_in_standard_errors(kept) < -CLEAR_GAIN
     monkeypatch.setattr("pisigma.calibration.hybrid.search.CLEAR_GAIN", gain + 1e-6)
     assert search.select_features(SERIES[:1], [SMALL], [PRODUCTS]).name == without.name
     assert search.trials[-1].log_evidence > without.posterior.log_evidence + CLEAR_EVIDENCE
@@ -114,17 +114,17 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     assert best.name == "gravity + series 6"
     assert best.max_effective_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
-    assert not wider.kept  # the geometry is nominal here
+    assert not wider.is_best_so_far  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEAR_EVIDENCE
-    assert together.held_out_ratio < 0.7 * min(line.held_out_ratio for line in before if line.kept)
+    assert together.held_out_ratio < 0.7 * min(line.held_out_ratio for line in before if line.is_best_so_far)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:
     q = random_joints(ROBOT, 80, 4)
     search = search_of(rows_of(torch.zeros_like(q), q))
     best = search.select_features(SERIES, [SMALL], [PRODUCTS])
-    assert best is search.geometry
-    assert not any(line.kept for line in search.trials[1:])
+    assert best is search.fit_without_features
+    assert not any(line.is_best_so_far for line in search.trials[1:])
 
 
 def test_a_fit_starts_from_the_sizes_and_the_noise_of_another(series: LinearisedArm) -> None:

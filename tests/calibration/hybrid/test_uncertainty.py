@@ -51,9 +51,9 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
     for g in range(3):
         ends = []
         for sign in (1, -1):
-            sizes = prior.sizes.clone()
+            sizes = prior.group_scales.clone()
             sizes[g] *= math.exp(sign * step)
-            ends.append(fit.solve(replace(prior, sizes=sizes), (0.4,)).x)
+            ends.append(fit.solve(replace(prior, group_scales=sizes), (0.4,)).x)
         slope = (ends[0] - ends[1]) / (2 * step)
         told = float((1 - prior.precision * covariance.diagonal())[prior.group == g].sum())
         told_at_all.append(told > MIN_EFFECTIVE)

@@ -36,7 +36,7 @@ def test_a_smaller_design_equals_one_built_directly(name: str) -> None:
     )
     assert_close(found.X, made.X)
     assert_close(found.K, made.K, rtol=1e-12, atol=1e-12 * float(made.K.abs().max()))
-    prior = small.prior_with_sizes_of(case.design, case.prior)
+    prior = small.prior_with_scales_of(case.design, case.prior)
     dense = DenseRegression.from_rows(small, case.rows)
     assert_same_posterior(found, dense, prior, case.noise, case.exactness)
 
@@ -89,7 +89,7 @@ def test_noise_that_is_small_compared_with_the_values_uses_normal_equations() ->
     """Traces of P cancel there; what comes back is that of the normal equations to the last bit."""
     case = few_values()
     noise = tuple(1e-4 * sigma for sigma in case.noise)
-    prior = replace(case.prior, sizes=case.prior.sizes * 10)
+    prior = replace(case.prior, group_scales=case.prior.group_scales * 10)
     dual, normal = (
         ValueCovariance.from_rows(case.design, case.rows),
         NormalEquations.from_rows(case.design, case.rows),

@@ -51,7 +51,7 @@ def test_offsets_are_found_again(name):
     found = fit_joint_offsets(model)
     assert_close(found.values, [0, *offsets[1:5], 0], atol=1e-9)
     assert found.unobservable == ("theta_1", "theta_6")
-    assert found.departure.max_mm < 1e-6
+    assert found.remaining_deviation.max_mm < 1e-6
     assert found.nominal.mean_mm > 1
     assert found.nominal.mean_mm < found.nominal.p95_mm < found.nominal.max_mm
     q = joints_around(name, 20)
@@ -67,15 +67,15 @@ def test_parallel_axes_have_unobservable_offsets():
     found = fit_joint_offsets(model)
     assert found.unobservable == ("theta_1", "d_3", "theta_4")
     assert_close(found.values, [0, 0.02, 0, 0], atol=1e-6)
-    assert found.departure.max_mm < 1e-4
+    assert found.remaining_deviation.max_mm < 1e-4
     assert np.abs(found.robot.base).max() < 0.1
 
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
 def test_a_learned_correction_is_approximated_in_part(name):
     found = fit_joint_offsets(hand_made_model(name))
-    assert 0 < found.departure.mean_mm < found.nominal.mean_mm
-    assert found.departures()["off_the_whole_model"]["mean_mm"] == found.departure.mean_mm
+    assert 0 < found.remaining_deviation.mean_mm < found.nominal.mean_mm
+    assert found.departures()["off_the_whole_model"]["mean_mm"] == found.remaining_deviation.mean_mm
 
 
 def test_a_model_without_a_region_is_refused():

@@ -37,7 +37,7 @@ def targets_at(q: torch.Tensor, T: torch.Tensor | None = None, name: str = "rb5"
         status=(Status.REACHED,) * len(q),
         branch=("only",) * len(q),
         q=q,
-        T=forward_kinematics(robot, q) if T is None else T,
+        T_nominal=forward_kinematics(robot, q) if T is None else T,
         sigma=torch.full((len(q),), 1e-5, dtype=torch.float64),
     )
     return replace(plain, **others)
@@ -82,7 +82,7 @@ def test_joint_targets_are_read_back(suffix, rows):
     assert program.poses == []
     q = in_radians(program.joints, suffix)
     assert_close(torch.rad2deg(q), torch.rad2deg(targets.q), atol=5.1e-7)
-    moved = forward_kinematics(targets.robot, q) - targets.T
+    moved = forward_kinematics(targets.robot, q) - targets.T_nominal
     assert float(moved[:, :3, 3].norm(dim=-1).max()) < 1e-6
 
 
@@ -93,8 +93,8 @@ def test_cartesian_targets_are_read_back(suffix, rows):
     targets = targets_at(some_joints(rows))
     program = read(targets, suffix, cartesian=True)
     T = transforms(program.poses, suffix)
-    assert_close(T[:, :3, 3], targets.T[:, :3, 3], atol=1e-9)
-    assert_close(T[:, :3, :3], targets.T[:, :3, :3], atol=3e-8)
+    assert_close(T[:, :3, 3], targets.T_nominal[:, :3, 3], atol=1e-9)
+    assert_close(T[:, :3, :3], targets.T_nominal[:, :3, :3], atol=3e-8)
     (T_root_poses,) = transforms([program.frame], suffix)
     (T_flange_tool,) = transforms([program.tool], suffix)
     bare = targets.robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))

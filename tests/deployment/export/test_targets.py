@@ -68,14 +68,14 @@ def test_rows_without_target_are_empty():
         status=status,
         branch=("only",) * len(status),
         q=q,
-        T=forward_kinematics(robot, q),
+        T_nominal=forward_kinematics(robot, q),
         sigma=torch.full((len(status),), 2e-5, dtype=torch.float64),
     )
     given = torch.tensor([s in (Status.REACHED, Status.OUTSIDE_DOMAIN) for s in status])
     nan = replace(
         targets,
         q=q.where(given[:, None], torch.nan),
-        T=targets.T.where(given[:, None, None], torch.nan),
+        T_nominal=targets.T_nominal.where(given[:, None, None], torch.nan),
         sigma=targets.sigma.where(given, torch.nan),
     )
     for row, s, there in zip(rows_of(nan), status, given.tolist(), strict=True):

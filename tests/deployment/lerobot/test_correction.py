@@ -62,13 +62,13 @@ def test_normalized_values_span_the_ranges_of_the_motors(model_folder, calibrati
     of_range = pisigma.LeRobotCorrection.load(model_folder, NAMES, "normalized", calibration)
     low, high = np.array(RANGES[:5]).T
     assert_close(of_range.joint_values(np.full(6, 100.0)), (high - low) / 2 * 2 * np.pi / 4096, rtol=1e-12)
-    assert_close(of_range.offset[:5] * (high - low) / 200 * 360 / 4096, ZEROS, atol=1e-9)
+    assert_close(of_range.value_offsets[:5] * (high - low) / 200 * 360 / 4096, ZEROS, atol=1e-9)
 
 
 def test_values_in_another_order_and_of_one_arm_of_two(model_folder, correction):
     names = [f"left_{name}" for name in reversed(NAMES)] + [f"right_{name}" for name in NAMES]
     pair = pisigma.LeRobotCorrection.load(model_folder, names, "degrees", prefix="left_")
-    assert_close(pair.offset, [*reversed(correction.offset), *[0.0] * 6])
+    assert_close(pair.value_offsets, [*reversed(correction.value_offsets), *[0.0] * 6])
 
 
 @pytest.mark.usefixtures("without_type_checker")
@@ -109,7 +109,7 @@ def test_a_data_set_is_corrected(layout, model_folder, tmp_path, correction):
     assert list(before) == list(after)
     for name, values in before.items():
         moved = name in ("action", "observation.state")
-        assert_close(after[name], values + correction.offset if moved else values, atol=1e-5)
+        assert_close(after[name], values + correction.value_offsets if moved else values, atol=1e-5)
     for file in sorted(source.rglob("*.parquet")):
         old, new = parquet.read_schema(file), parquet.read_schema(tmp_path / "new" / file.relative_to(source))
         assert new.equals(old, check_metadata=True)
@@ -140,7 +140,9 @@ def test_statistics_move_with_the_values(layout, model_folder, tmp_path, correct
     for old, new in zip(before, after, strict=True):
         assert set(old) == set(new) >= {"mean", "std", "min", "max", "count"}
         for key, value in old.items():
-            assert_close(new[key], value + correction.offset if key in STATISTICS else value, atol=1e-9)
+            assert_close(
+                new[key], value + correction.value_offsets if key in STATISTICS else value, atol=1e-9
+            )
 
 
 def test_a_data_set_is_not_corrected_twice_nor_overwritten(model_folder, tmp_path):
@@ -190,7 +192,7 @@ def test_both_arms_of_a_pair_are_corrected_one_after_the_other(model_folder, cor
     left = correct_lerobot_dataset(source, model_folder, tmp_path / "left", "degrees", prefix="left_").folder
     both = correct_lerobot_dataset(left, model_folder, tmp_path / "both", "degrees", prefix="right_").folder
     before, after = columns(source), columns(both)
-    assert_close(after["action"], before["action"] + np.tile(correction.offset, 2), atol=1e-5)
+    assert_close(after["action"], before["action"] + np.tile(correction.value_offsets, 2), atol=1e-5)
     assert set(json.loads((both / RECORD).read_text())) == {"left_", "right_"}
     for prefix in ("left_", "right_", "left_arm_"):
         with refused(MeasurementError, file="pisigma.json"):
@@ -212,7 +214,7 @@ def test_files_that_cannot_be_read_or_written_are_refused(broken, model_folder, 
 def test_values_by_name_keep_their_type_and_integers_are_refused(kind, correction):
     frame = {name: kind(10.0) for name in NAMES}
     moved = correction.true_values(frame)
-    for name, offset in zip(NAMES, correction.offset, strict=True):
+    for name, offset in zip(NAMES, correction.value_offsets, strict=True):
         assert type(moved[name]) is type(frame[name])
         assert getattr(moved[name], "dtype", None) == getattr(frame[name], "dtype", None)
         assert_close(np.squeeze(moved[name]), 10.0 + offset, atol=1e-5)
@@ -225,5 +227,5 @@ def test_velocities_and_torques_are_not_changed(model_folder, correction):
     names = [f"{name.removesuffix('.pos')}{kind}" for name in NAMES for kind in (".pos", ".vel", ".torque")]
     wide = pisigma.LeRobotCorrection.load(model_folder, names, "degrees")
     expected = np.zeros((6, 3))
-    expected[:, 0] = correction.offset
-    assert_close(wide.offset, expected.reshape(-1))
+    expected[:, 0] = correction.value_offsets
+    assert_close(wide.value_offsets, expected.reshape(-1))

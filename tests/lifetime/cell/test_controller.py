@@ -163,7 +163,7 @@ def test_days_are_those_of_the_time_zone_of_the_machine(tmp_path, monkeypatch, z
         assert history.record("accepted", day, "", "A. Auditor").day == day
         record_controller(history, "offsets", day, "")
         since = ControllerEntry(day, "offsets", "", f"{utc[:14]}00:00.000+00:00")
-        assert ControllerHistory((since,), history.exports()).fits(made, ())
+        assert ControllerHistory((since,), history.exports()).matches_model(made, ())
     finally:
         monkeypatch.undo()
         time.tzset()

@@ -56,7 +56,7 @@ def test_entries_are_read_as_they_were_written(history):
     assert other.models() == (MODEL,)
     assert other.events() == (EVENT,)
     assert other.checks() == (CHECK,)
-    assert other.uses() == (USE,)
+    assert other.model_in_use_changes() == (USE,)
     assert other.exports() == (EXPORT,)
     assert other.controller() == (ACTIVE,)
     assert other.in_use == MODEL
@@ -83,7 +83,7 @@ def test_the_last_use_applies_and_the_earlier_ones_are_kept(history):
     assert history.in_use.name == "b"
     history.add(replace(USE, model=""))
     assert history.in_use is None
-    assert [one.model for one in history.uses()] == ["a", "b", ""]
+    assert [one.model for one in history.model_in_use_changes()] == ["a", "b", ""]
 
 
 def test_twelve_changes_of_the_model_in_use_are_undone_one_after_the_other(history):
@@ -104,10 +104,10 @@ def test_an_older_history_gets_the_tables_and_columns_that_it_lacks(history):
         database.execute("INSERT INTO uses VALUES (?, ?, ?)", (USE.model, USE.since, USE.reason))
         database.execute("PRAGMA user_version = 1")
     database.close()
-    assert history.uses() == (USE,)
+    assert history.model_in_use_changes() == (USE,)
     assert history.controller() == ()
     history.add(replace(USE, undo=True))
-    assert [one.undo for one in history.uses()] == [False, True]
+    assert [one.undo for one in history.model_in_use_changes()] == [False, True]
 
 
 def test_a_missing_model_is_refused_with_the_nearest_name(history):
@@ -262,7 +262,7 @@ def test_a_cell_of_schema_1_keeps_every_entry_and_the_monitored_sessions_of_its_
     ]
     for one, record in zip(history.monitored_sessions(), read_sessions(history, model.sha256), strict=True):
         assert_close(one.rms_mm, record.session.rms * 1e3)
-        assert_close(one.rms_after_mm, record.session.rms_after * 1e3)
+        assert_close(one.rms_after_mm, record.session.rms_after_recalibration * 1e3)
         assert (one.verdict, one.unchanged) == (record.session.verdict, record.session.unchanged_probability)
     assert not beside.exists()
     assert history.database.upgrade() == SCHEMA_VERSION

@@ -33,33 +33,33 @@ def loads(cell):
 
 def test_a_change_is_loaded_once(cell, loads):
     names, in_use, _ = loads
-    in_use.check()
+    in_use.load_if_changed()
     put_into_use(cell, SECOND)
-    in_use.check()
-    in_use.check()
+    in_use.load_if_changed()
+    in_use.load_if_changed()
     assert names == [FIRST, SECOND]
     cell.use(None, "")
-    in_use.check()
+    in_use.load_if_changed()
     assert names == [FIRST, SECOND, FIRST]
 
 
 def test_nothing_is_read_while_the_history_does_not_change(cell, loads, monkeypatch):
     _, in_use, _ = loads
     time.sleep(2 * model_in_use.SETTLED)
-    in_use.check()
+    in_use.load_if_changed()
     monkeypatch.setattr(model_in_use, "model_folder", None)
-    in_use.check()
+    in_use.load_if_changed()
 
 
 def test_two_changes_within_the_rounding_of_file_times_are_both_seen(cell, loads, monkeypatch):
     names, in_use, _ = loads
     monkeypatch.setattr(model_in_use, "SETTLED", 60.0)  # however slow the machine is
     put_into_use(cell, SECOND)
-    in_use.check()
+    in_use.load_if_changed()
     same = in_use._state()
     monkeypatch.setattr(ModelInUse, "_state", lambda self: same)
     put_into_use(cell, FIRST)
-    in_use.check()
+    in_use.load_if_changed()
     assert names == [FIRST, SECOND, FIRST]
 
 
@@ -73,7 +73,7 @@ def test_a_model_that_cannot_be_loaded_leaves_the_one_before(cell, loads):
     time.sleep(3 * model_in_use.INTERVAL)
     assert (len(reports), names, in_use.folder.name) == (1, [FIRST], FIRST)
     problems.clear()
-    in_use.check(retry_failed=True)
+    in_use.load_if_changed(retry_failed=True)
     assert (names, in_use.problem) == ([FIRST, SECOND], "")
     in_use.stop()
 
@@ -125,14 +125,14 @@ def test_changes_are_followed_on_systems_without_fork(cell, loads, monkeypatch):
 def test_findings_that_cannot_be_read_are_read_again(cell, loads, monkeypatch):
     names, in_use, _ = loads
     time.sleep(2 * model_in_use.SETTLED)
-    in_use.check()
+    in_use.load_if_changed()
     put_into_use(cell, SECOND)
     time.sleep(2 * model_in_use.SETTLED)
     with monkeypatch.context() as patched:
         patched.setattr(History, "controller", locked)
-        in_use.check()
+        in_use.load_if_changed()
     assert (names, bool(in_use.problem)) == ([FIRST], True)
-    in_use.check()
+    in_use.load_if_changed()
     assert (names, in_use.problem) == ([FIRST, SECOND], "")
 
 
@@ -143,7 +143,7 @@ def locked(history):
 def test_a_cell_without_a_model_in_use_is_refused_at_first_and_reported_later(cell, loads):
     _, in_use, _ = loads
     put_into_use(cell, "")
-    in_use.check()
+    in_use.load_if_changed()
     assert (in_use.folder.name, bool(in_use.problem)) == (FIRST, True)
     with refused(ModelError, file=cell.folder):
         ModelInUse(cell.folder, "serve", lambda folder: None)

@@ -56,7 +56,7 @@ LATE = Event("2026-02-01", "instrument", "", "2026-02-11T08:00:00+00:00")
 CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
-    "session_incomplete": (replace(MEASURED, measured_pose_text="3 of 50 poses"), "import"),
+    "session_incomplete": (replace(MEASURED, too_few_poses_text="3 of 50 poses"), "import"),
     "several_arms": (replace(PLANNED, unrecorded_files=("a.csv",), has_several_arms=True), ""),
     "not_taken_in": (replace(PLANNED, unrecorded_files=("2026-01-10.csv",)), "import"),
     "file_refused": (
@@ -281,7 +281,7 @@ def test_a_model_that_fits_the_joint_zeros_is_used_or_else_calibrated():
     assert step.command.split()[1:] == ["use", "cell", "b"]
     refused = check("recalibrate", "a", "2026-03-10", "not_trusted", at="2026-03-11T08:00:00+00:00")
     step = next_step(replace(facts, checks=(*facts.checks, refused)))
-    assert (step.state, step.verb) == ("other_joint_zeros", "calibrate")
+    assert (step.state, step.automatic_command) == ("other_joint_zeros", "calibrate")
     without = ControllerHistory(
         (*OFFSETS.changes, replace(OFFSETS.changes[0], day="2026-03-20", sha256="")), OFFSETS.exports
     )
@@ -293,7 +293,7 @@ def test_a_model_that_was_changed_is_replaced_by_another_or_made_again():
     facts, _ = CASES["model_changed"]
     newer = replace(facts, models=(MODEL, NEWER))
     assert next_step(newer).command == "pisigma use cell b"
-    assert next_step(replace(newer, changed_models=("a", "b"))).verb == "calibrate"
+    assert next_step(replace(newer, changed_models=("a", "b"))).automatic_command == "calibrate"
     event = Event("2026-02-11", "collision", "", "2026-02-11T08:00:00+00:00")
     assert next_step(replace(facts, events=(event,))).command == "pisigma plan cell"
     not_in_use = replace(facts, in_use=None)
@@ -322,7 +322,7 @@ def test_an_event_that_was_recorded_after_a_calibration_of_rows_before_and_after
         == state
     )
     again = replace(facts, models=(MIXED, replace(MIXED, name="b", made="2026-02-12T08:00:00+00:00")))
-    assert next_step(again).verb is None
+    assert next_step(again).automatic_command is None
 
 
 def test_changed_settings_or_events_let_a_calibration_that_failed_be_repeated():

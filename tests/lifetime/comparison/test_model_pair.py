@@ -36,7 +36,7 @@ def test_corrections_of_networks_are_compared():
     T = forward_kinematics(second.robot, second.nominal_joints(q))
     expected = T[:, :3, 3] - forward_kinematics(first.robot, q)[:, :3, 3]
     assert_close(pair.displacement(q)[:, :3], expected, atol=1e-12)
-    displacement = Displacement.from_pair(pair, pair.workspace, "the workspace")
+    displacement = Displacement.from_pair(pair, pair.workspace_joints, "the workspace")
     assert len(displacement.q) + displacement.poses_not_predicted == 3000
 
 

@@ -57,7 +57,7 @@ def test_nothing_is_named_if_nothing_moved():
     assert not any(one.likely_bodies for one in found)
     assert all(one.is_one_body for one in found)
     # without faults, probabilities are uniform between 0 and 1
-    assert 0.2 < sum(one.probability for one in found) / len(found) < 0.8
+    assert 0.2 < sum(one.p_value for one in found) / len(found) < 0.8
 
 
 @pytest.mark.parametrize("body", ["left", "right", "hall"])
@@ -101,7 +101,7 @@ def test_frame_whose_base_was_not_determined_is_not_compared():
         found = frames_of_model(model(0, 0), rows_now(0, 0, STILL, ""), "base")
     assert RemeasuredArm(known, STILL, found).frames == ("hall",)
     root = known.covariance_root.clone()
-    root[known.base_rows("hall")[0]] = 0.0
+    root[known.base_indices("hall")[0]] = 0.0
     held = replace(known.uncertainty, covariance_root=CovarianceRoot(root))
     arm = RemeasuredArm(replace(known, uncertainty=held), STILL, found)
     assert arm.frames == ()

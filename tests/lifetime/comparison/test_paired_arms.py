@@ -46,7 +46,7 @@ def test_a_difference_of_2_deg_is_named_with_its_sign_and_arm(seed):
         named = [(one.joint, one.moved_arm) for one in found if one.verdict == "different"]
         assert named == [(NAMES[joint], moved)]
         expected = 2.0 * sign * (1 if moved == "leader" else -1)
-        error = math.degrees(found[joint].value) - expected
+        error = math.degrees(found[joint].follower_minus_leader) - expected
         assert abs(error) < 5 * math.degrees(found[joint].standard_error)
 
 
@@ -82,7 +82,7 @@ def test_full_turns_are_no_difference():
     for turns in (0.0, 2 * math.pi, -2 * math.pi * random.integers(0, 2, leader.shape)):
         (one,) = compare_paired_arms(leader, follower + turns, ("roll",))
         assert one.verdict == "different"
-        assert_close(one.value, math.radians(2.0), atol=math.radians(0.5))
+        assert_close(one.follower_minus_leader, math.radians(2.0), atol=math.radians(0.5))
 
 
 def test_without_positions_the_arm_is_unknown():

@@ -19,23 +19,23 @@ from pisigma.validation.held_out.reference_models import nominal_model
 def test_only_the_moved_joint_differs_when_the_base_moved_as_well(forth):
     models = model_of(50), after_collision()
     differences = parameter_differences(ModelPair.from_models(*models[:: 1 if forth else -1], "fitted"))
-    (joint,) = (one.shift for one in differences.differing)
+    (joint,) = (one.shift for one in differences.significant_differences)
     assert joint.what == "joint 3"
     assert_close(joint.shift, 0.1 if forth else -0.1, atol=0.005)
     assert joint.interval[0] < (0.1 if forth else -0.1) < joint.interval[1]
     assert differences.remainder is not None
     assert not differences.remainder.significant
-    base = [one for one in differences.frames if one.what == "base"]
+    base = [one for one in differences.frame_movements if one.what == "base"]
     assert_close(base[0].shift, math.hypot(300, 200, 100), atol=0.2)
-    tool = [one for one in differences.frames if one.what == "tool"]
+    tool = [one for one in differences.frame_movements if one.what == "tool"]
     assert_close(tool[0].shift, 0.0, atol=0.1)
 
 
 def test_fixed_frames_find_the_same_joint():
     models = model_of(50), model_of(61, COLLISION)
     differences = parameter_differences(ModelPair.from_models(*models, "fixed"))
-    assert [one.shift.what for one in differences.differing] == ["joint 3"]
-    assert differences.frames == ()
+    assert [one.shift.what for one in differences.significant_differences] == ["joint 3"]
+    assert differences.frame_movements == ()
 
 
 def test_models_of_disjoint_rows_differ_by_chance_only():
@@ -44,7 +44,7 @@ def test_models_of_disjoint_rows_differ_by_chance_only():
     outside = tested = 0
     for pair in itertools.combinations(models, 2):
         differences = parameter_differences(ModelPair.from_models(*pair, "fitted"))
-        assert differences.differing == ()
+        assert differences.significant_differences == ()
         assert differences.remainder is not None
         assert not differences.remainder.significant
         for one in differences.parameters:
@@ -66,7 +66,7 @@ def test_parameters_equivalent_to_base_and_tool_have_no_shift():
 def test_a_nominal_robot_has_no_uncertainty():
     model = model_of(50)
     differences = parameter_differences(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
-    assert differences.differing
+    assert differences.significant_differences
     assert all(one.sigmas[1] == 0.0 for one in differences.parameters)
 
 
@@ -75,7 +75,7 @@ def test_a_displacement_that_is_explained_completely_is_due_to_chance():
     model = model_of(50)
     effects = ParameterEffects(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
     effects._M, effects._y = effects._W @ effects._W.t(), effects._W.sum(1, keepdim=True)
-    assert effects.unexplained_probability(range(len(effects.standard_scores([])) - 12)) == 1.0
+    assert effects.remainder_p_value(range(len(effects.standard_scores([])) - 12)) == 1.0
 
 
 def test_a_model_without_posterior_is_compared_without_tests():

@@ -46,7 +46,7 @@ def test_shared_errors_are_estimated_or_stated_to_be_in_a_sum(prior):
         one.name: one for one in summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)]).parameters
     }
     true = dict(zip(prior.names, common_errors().flatten().tolist(), strict=True))
-    alone = [name for name in true if not parameters[name].in_a_sum]
+    alone = [name for name in true if not parameters[name].is_determined_only_in_sum]
     assert {"a_2", "a_3", "alpha_2", "alpha_3", "theta_3", "d_5"} <= set(alone)
     for name in alone:
         scale = 1e3 if parameters[name].unit == "mm" else np.rad2deg(1)

@@ -46,8 +46,8 @@ def test_false_alarms_are_rare():
 def test_a_recalibration_is_recommended_after_a_collision():
     session, _ = judged(rows_after_change(10, 3, moved_joint(3, 0.25)))
     assert session.recalibrate
-    assert session.rms_after < 0.2 * session.rms
-    assert_close(session.gain, session.rms - session.rms_after, rtol=1e-12)
+    assert session.rms_after_recalibration < 0.2 * session.rms
+    assert_close(session.expected_gain, session.rms - session.rms_after_recalibration, rtol=1e-12)
     assert not judged(rows_after_change(10, 3))[0].recalibrate
 
 
@@ -86,9 +86,9 @@ def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
     assert [one.what for one in session.movements] == [*expected, "base", "base"]
     assert session.recalibrate == bool(joint)
     assert "base" in session.relocated_frames
-    assert not session.observable[0]
-    assert "joint 1" in session.unobservable[0]
-    assert "base" in session.unobservable[0]
+    assert not session.zero_is_observable[0]
+    assert "joint 1" in session.unobservable_sentences[0]
+    assert "base" in session.unobservable_sentences[0]
 
 
 def test_a_small_motion_of_the_base_is_not_mistaken_for_a_joint():

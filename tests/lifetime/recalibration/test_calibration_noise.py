@@ -59,7 +59,7 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
         )
         recalibrated = recalibrate(models[of_model], rows)
     assert [one.what for one in session.movements] == ["joint 3"]
-    assert all(session.observable)
+    assert all(session.zero_is_observable)
     assert_close(session.movements[0].shift, MOVED_DEG, atol=0.005)
     assert [one.what for one in recalibrated.movements] == ["joint 3"]
     assert recalibrated.summary.kept_candidate == "recalibrated"
@@ -77,7 +77,7 @@ def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
             monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions_of_call[-1].session
         )
     assert session.verdict == "unchanged"
-    assert all(session.observable)
+    assert all(session.zero_is_observable)
 
 
 @pytest.mark.parametrize("of_model", KINDS)

@@ -49,13 +49,13 @@ def test_a_candidate_that_cannot_be_fitted_is_not_kept():
 
 def test_a_row_that_every_candidate_misses_does_not_count():
     judged = decided(recalibrated=[1.0, 1.0, 1.0, 90.0], old=[1.2] * 3 + [80.0], scratch=[3.0] * 3 + [50.0])
-    assert (judged.kept, judged.rows) == ("recalibrated", 3)
+    assert (judged.kept, judged.held_out_row_count) == ("recalibrated", 3)
     assert_close(judged.rms["recalibrated"], 1.0)
 
 
 def test_without_held_out_rows_the_recalibrated_model_is_kept():
     judged = decided(recalibrated=[math.nan] * 2, old=[math.nan] * 2, scratch=[math.nan] * 2)
-    assert (judged.kept, judged.rows) == ("recalibrated", 0)
+    assert (judged.kept, judged.held_out_row_count) == ("recalibrated", 0)
     assert not any(character.isdigit() for character in judged.sentence)  # no errors are known
 
 
@@ -67,7 +67,7 @@ def test_held_out_rows_decide(count):
     whole = adapt(problem)
     calibrator = HybridCalibrator(posterior.space.robot)
     judged = choose_candidate(model, whole, frozenset(), rows, calibrator, lambda what: None)
-    assert (judged.kept, judged.rows) == ("recalibrated", count)
+    assert (judged.kept, judged.held_out_row_count) == ("recalibrated", count)
     kept, old = judged.rms["recalibrated"], judged.rms["old"]
     assert kept is not None
     assert old is not None

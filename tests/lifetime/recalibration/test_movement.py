@@ -20,7 +20,7 @@ JOINT = Movement("joint 3", 0.25, 1e-3, "deg", 0.999)
     ],
 )
 def test_an_uncertainty_is_never_shown_as_zero(movement, figures):
-    assert re.findall(r"-?[0-9]+[.][0-9]+", movement.size) == figures
+    assert re.findall(r"-?[0-9]+[.][0-9]+", movement.shift_text) == figures
 
 
 def test_histories_of_earlier_versions_are_read():

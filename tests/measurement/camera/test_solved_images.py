@@ -78,7 +78,7 @@ def test_intrinsics_with_zero_deviation_are_fixed() -> None:
 
 def test_impossible_intrinsics_are_refused() -> None:
     (pose,) = poses_of(camera_cell(1).images)(CAMERA)
-    pulled = replace(pose, information_root=np.eye(9), residual=np.full(9, -1e6))
+    pulled = replace(pose, information_root=np.eye(9), information_residual=np.full(9, -1e6))
     sigma = prior_sigmas(CAMERA, "free")
     with refused(MeasurementError, file="x", value="wrist"):
         solve_images(CAMERA, sigma, lambda camera: [pulled], SquaredLoss(), "x")

@@ -31,19 +31,19 @@ def sniffed(lines: list[str], decimal: Decimal | None = None) -> Dialect:
 )
 def test_separator_and_decimal_sign(lines: list[str], separator: str, decimal: str):
     dialect = sniffed(lines)
-    assert (dialect.separator, dialect.numbers.decimal) == (separator, decimal)
+    assert (dialect.separator, dialect.number_format.decimal) == (separator, decimal)
 
 
 def test_a_stated_sign_is_used():
-    assert sniffed(["1,250;2,125"], ".").numbers.decimal == "."
+    assert sniffed(["1,250;2,125"], ".").number_format.decimal == "."
 
 
 def test_commas_that_may_separate_thousands_or_cells_are_refused():
     lines = ["q1,x", '10,"1,234"', '11,"-2,345"']
     with refused(MeasurementError, line=2, column=2, value="1,234"):
         sniffed(lines)
-    assert sniffed(lines, ".").numbers.text("1,234") == "1234"
-    assert sniffed([*lines, '12,"0,345"']).numbers.text("1,234") == "1.234"
+    assert sniffed(lines, ".").number_format.to_plain_number("1,234") == "1234"
+    assert sniffed([*lines, '12,"0,345"']).number_format.to_plain_number("1,234") == "1.234"
 
 
 @pytest.mark.parametrize("lines", [[], ["only words here", "and here"], ["1.5", "2.5"]])
@@ -65,9 +65,9 @@ def test_no_table_is_refused(lines: list[str]):
 def test_groups_of_thousands_that_may_be_decimals_are_refused(lines: list[str], column: int, value: str):
     with refused(MeasurementError, file="a.csv", line=2, column=column, value=value):
         sniffed(lines)
-    assert sniffed(lines, ".").numbers.decimal == "."
+    assert sniffed(lines, ".").number_format.decimal == "."
 
 
 def test_numbers_of_points_do_not_make_three_decimals_ambiguous():
-    assert sniffed(["n;x;y", "1;2.104;3.200", "2;1.950;1.100", "3;1.1;2.5"]).numbers.decimal == "."
-    assert sniffed(["n;x;y", "7;2.104;3.200", "8;1.950;1.100"]).numbers.decimal == "."
+    assert sniffed(["n;x;y", "1;2.104;3.200", "2;1.950;1.100", "3;1.1;2.5"]).number_format.decimal == "."
+    assert sniffed(["n;x;y", "7;2.104;3.200", "8;1.950;1.100"]).number_format.decimal == "."

@@ -32,7 +32,7 @@ from pisigma.measurement.foreign.dialect import NumberFormat, is_missing
     ],
 )
 def test_numbers(decimal: str, cell: str, text: str | None):
-    assert NumberFormat(decimal).text(cell) == text
+    assert NumberFormat(decimal).to_plain_number(cell) == text
 
 
 def test_a_group_without_decimals_may_be_a_decimal():

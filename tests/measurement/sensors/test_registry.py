@@ -71,7 +71,7 @@ class Inclinometer(AbstractSensor):
         if not bool(present.any()):
             return None
         measured = torch.stack([rows.readings("tilt_x"), rows.readings("tilt_y")])
-        up, tool = rows.bases[:, 2, :3].t(), rows.tools.permute(1, 2, 0)
+        up, tool = rows.base_anchors[:, 2, :3].t(), rows.tool_rotation_anchors.permute(1, 2, 0)
         return cls(torch.where(present, measured, 0.0), up, tool, present, rows.sigma(present, "rad"))
 
     def _up_in_tool(self, R: Tensor, rows: slice, up: Tensor) -> Tensor:
@@ -113,9 +113,11 @@ class HeightGauge(AbstractSensor):
         if not bool(present.any()):
             return None
         names = gauges(rows.measurements)
-        measured = torch.where(present, rows.readings("height") - rows.bases[:, 2, 3], 0.0)
-        up = rows.bases[:, 2, :3].t()
-        return cls(measured, up, rows.numbers(names, distinct_names(names)), present, rows.sigma(present))
+        measured = torch.where(present, rows.readings("height") - rows.base_anchors[:, 2, 3], 0.0)
+        up = rows.base_anchors[:, 2, :3].t()
+        return cls(
+            measured, up, rows.name_indices(names, distinct_names(names)), present, rows.sigma(present)
+        )
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Tensor:
         predicted = (self.up[:, rows] * motion.position).sum(0) - unknowns["gauge"][0, self.gauge[rows]]
@@ -219,7 +221,7 @@ def test_a_calibration_uses_the_rows_and_evaluates_held_out_rows() -> None:
     result = pisigma.GeometricCalibrator(robot).fit(data.select(~test))
     assert {noise.sensor for noise in result.noise} == {"position", "tilt", "height"}
     assert all(noise.sigma < 3e-6 for noise in result.noise)
-    assert_close(result.unknowns["gauge"]["a"], np.array([0.05]), atol=2e-5)
+    assert_close(result.sensor_unknowns["gauge"]["a"], np.array([0.05]), atol=2e-5)
     errors = result.errors_of(data.select(test))
     assert {name: len(values[0]) for name, values in errors.items()} == {
         "position": 3,

@@ -101,7 +101,7 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     with refused(ModelError, file="model.yaml", column="format", value=2):
         load_model(tmp_path / "arm")
     done = upgrade_folder(tmp_path / "arm", check_written)
-    assert (done.name, done.before, done.after) == ("arm", 2, 5)
+    assert (done.name, done.format_before, done.format_after) == ("arm", 2, 5)
     assert numbers_in(done.changes[0]) == [3]  # the last format whose correction faded
     upgraded = load_model(tmp_path / "arm")
     assert without_remarks(upgraded.metrics) == without_remarks(model.metrics)
@@ -138,7 +138,7 @@ def test_kernels_of_another_version_are_written_again(tmp_path):
     assert not upgrade_folder(folder, check_written).changes
     (folder / "compiled.npz").write_bytes(b"of another version")
     done = upgrade_folder(folder, check_written)
-    assert (done.before, done.after, len(done.changes)) == (FORMAT, FORMAT, 1)
+    assert (done.format_before, done.format_after, len(done.changes)) == (FORMAT, FORMAT, 1)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == written
 
 

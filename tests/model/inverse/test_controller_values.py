@@ -93,8 +93,8 @@ def test_jacobian_and_accuracy_take_the_controllers_values(ik, q):
 
 
 def test_directions_of_approach_are_converted_to_those_of_the_joints(ik, q, monkeypatch):
-    sides, solver, stated = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]), ik.controller.ik, []
-    expected, T = ik.controller.coupling.approach_to_dh(sides), ik.forward(q[0])
+    sides, solver, stated = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]), ik.controller_solver.ik, []
+    expected, T = ik.controller_solver.coupling.approach_to_dh(sides), ik.forward(q[0])
     assert not np.array_equal(expected, sides)
     for name in ("__call__", "all_branches", "forward", "accuracy"):
         unpatched = getattr(CorrectedIK, name)

@@ -129,13 +129,13 @@ def test_the_first_branch_inside_the_limits_is_chosen():
     limited = CorrectedIK(
         replace(model, robot=robots[0], calibrated=robots[1], branches=("back/elbow_up/flip",))
     )
-    assert limited.branches[limited.order[0]] == "back/elbow_up/flip"
-    assert sorted(limited.order) == list(range(8))
+    assert limited.branches[limited.branch_order[0]] == "back/elbow_up/flip"
+    assert sorted(limited.branch_order) == list(range(8))
     solution = limited(T)
     elbow = every.q[..., 2].remainder(2 * torch.pi)
     inside = (every.status != Status.UNREACHABLE) & (elbow <= 3.2)
-    rank = torch.where(inside[:, torch.tensor(limited.order)], torch.arange(8), 8)
-    wanted = torch.tensor([*limited.order, -1])[rank.amin(-1)]
+    rank = torch.where(inside[:, torch.tensor(limited.branch_order)], torch.arange(8), 8)
+    wanted = torch.tensor([*limited.branch_order, -1])[rank.amin(-1)]
     clear = wanted >= 0
     assert float((solution.branch[clear] == wanted[clear]).double().mean()) > 0.94
     outside = ~clear & (every.status != Status.UNREACHABLE).any(-1)
@@ -153,7 +153,7 @@ def test_poses_in_millimetres_and_near_misses_are_unreachable(kernels):
         solution = solve(T, near=near)
         assert bool((solution.status == Status.UNREACHABLE).all())
         assert bool(solution.q.isnan().all())
-        assert bool((solution.branch == ik.order[0]).all())
+        assert bool((solution.branch == ik.branch_order[0]).all())
 
 
 def arm_with_backlash(size: float = 2e-3):

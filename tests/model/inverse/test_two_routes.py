@@ -243,7 +243,7 @@ def test_a_folder_that_is_changed_after_loading_is_refused(folder, tmp_path):
 def test_a_model_in_memory_equals_its_folder(poses, ik):
     made = CorrectedIK(ik.model)
     assert (made.name, made.branches, made.joints) == (ik.name, ik.branches, ik.joints)
-    assert made.order == ik.order
+    assert made.branch_order == ik.branch_order
     assert made.closed_form == ik.closed_form
     assert_close(made.limits, ik.limits)
     assert_close(made.revolute, ik.revolute)

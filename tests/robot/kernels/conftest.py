@@ -46,7 +46,7 @@ def draw_correction(robot: Robot, joints: bool, seed: int = 0) -> JointCorrectio
     with torch.no_grad():
         for weight, chosen in zip(correction.linear, features, strict=True):
             drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
-            weight.copy_(5e-4 / math.sqrt(chosen.count) * drawn * chosen.used)
+            weight.copy_(5e-4 / math.sqrt(chosen.column_count) * drawn * chosen.used)
         for weight in (correction.weight, correction.bias):
             weight.copy_(0.02 * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
     return correction.requires_grad_(False)

@@ -17,7 +17,7 @@ TRIPLES = ["x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "arm64-apple
 
 
 def test_the_intermediate_code_is_that_of_the_sources():
-    assert build.read_ready() is not None, (
+    assert build.read_intermediate_code() is not None, (
         "the kernels changed: run python -m pisigma.joint_correction.registry"
     )
 
@@ -65,13 +65,16 @@ def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
 
 def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr(build, "FILE", tmp_path / "kernels.ll.xz")
-    assert build.read_ready() is None
-    build.write_ready("define", KernelForms(("series",), ("scara",)), numba="1")
-    assert (build.read_ready(), build.ready_forms()) == ("define", KernelForms(("series",), ("scara",)))
+    assert build.read_intermediate_code() is None
+    build.write_intermediate_code("define", KernelForms(("series",), ("scara",)), numba="1")
+    assert (build.read_intermediate_code(), build.stored_code_forms()) == (
+        "define",
+        KernelForms(("series",), ("scara",)),
+    )
     whole = build.FILE.read_bytes()
     for wrong in (whole[:-3], b"", b"[1]\nx", whole.replace(b'"sources": "', b'"sources": "0')):
         build.FILE.write_bytes(wrong)
-        assert build.read_ready() is None
+        assert build.read_intermediate_code() is None
 
 
 def test_without_code_and_numba_the_error_names_the_extra(monkeypatch):
@@ -184,4 +187,4 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path, stored):
 
 def test_the_code_names_its_compilers():
     assert b'"numba"' in build.FILE.read_bytes().partition(b"\n")[0]
-    assert build.ENTRY in (build.read_ready() or "")
+    assert build.ENTRY in (build.read_intermediate_code() or "")

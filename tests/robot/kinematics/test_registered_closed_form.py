@@ -125,7 +125,7 @@ def test_a_compiled_form_is_added_to_the_kernels(mast, registered, monkeypatch):
     monkeypatch.delitem(sys.modules, "pisigma.robot.kernels.closed_form", raising=False)
     forms = KernelForms.registered()
     assert forms.closed_forms == ("scara", "mast")
-    assert not (machine_code.ready_forms() or forms).cover(forms)
+    assert not (machine_code.stored_code_forms() or forms).cover(forms)
     q = np.array([0.4, -1.2])
     description, branches = describe_as_arrays(model_of(mast, torch.from_numpy(q)[None]))
     assert description.forms.closed_forms == ("mast",)

@@ -78,7 +78,7 @@ def test_repeated_poses_after_the_instrument_was_moved_have_no_accuracy(cell):
     cell.history.record("instrument", "2026-09-01")
     cell.add_session(rows, day="2026-09-10")
     found = acceptance_of(cell)
-    assert (found.measured.session, found.measured.fitted) == ("2026-09-10", ("base",))
+    assert (found.measured.session, found.measured.fitted_frames) == ("2026-09-10", ("base",))
     assert not found.is_contradicted
     assert [(one.rows, one.accuracy, one.repeatability) for one in found.repeats] == [(2, None, None)] * 4
     assert found.to_json()["repeats"]["degrees_of_freedom"] == 12

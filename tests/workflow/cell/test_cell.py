@@ -265,7 +265,7 @@ def test_a_new_calibration_goes_into_use_only_where_new_rows_show_that_it_is_bet
     same, again = cell.calibrate(model="geometric", folds=0)
     assert same.trusted
     assert cell.history.in_use == entry
-    assert again.name not in {one.model for one in cell.history.uses()}
+    assert again.name not in {one.model for one in cell.history.model_in_use_changes()}
 
 
 def test_load_takes_the_model_in_use(year, tmp_path):

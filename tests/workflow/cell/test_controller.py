@@ -63,10 +63,20 @@ def test_every_command_checks_the_table_first(command, cell, used, tmp_path, mon
     monkeypatch.setattr(
         controller, "RULES", dict.fromkeys(RULES, ("allow",) * 3) | {command: ("refuse",) * 3}
     )
-    before = cell.history.uses(), cell.history.sessions(), cell.history.models(), cell.history.exports()
+    before = (
+        cell.history.model_in_use_changes(),
+        cell.history.sessions(),
+        cell.history.models(),
+        cell.history.exports(),
+    )
     with refused(ModelError, file=cell.folder):
         COMMANDS[command](cell, tmp_path)
-    after = cell.history.uses(), cell.history.sessions(), cell.history.models(), cell.history.exports()
+    after = (
+        cell.history.model_in_use_changes(),
+        cell.history.sessions(),
+        cell.history.models(),
+        cell.history.exports(),
+    )
     assert after == before
     assert not list(tmp_path.glob("exported*"))
 
@@ -93,7 +103,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     old = cell.history.in_use
     followed, served = pisigma.load(cell.folder), ServedModels(cell=cell.folder)
     record_active_export(cell, used.folder.parent / "offsets.csv", day(10))
-    followed._in_use.check()
+    followed._in_use.load_if_changed()
     (sentence,) = served.reload()
     assert "offsets.csv" in sentence
     assert served.is_refused
@@ -119,12 +129,15 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     assert (session.judged_by, "offsets.csv" in session.remark) == ("robot", True)
     assert [len(one["controller"]) for one in cell.status().to_json()["sessions"]] == [0, 0, 1]
     assert "offsets.csv" in cell.monitor().warnings[0]
-    assert (cell.status().step.state, cell.status().step.verb) == ("other_joint_zeros", "recalibrate")
+    assert (cell.status().step.state, cell.status().step.automatic_command) == (
+        "other_joint_zeros",
+        "recalibrate",
+    )
     result, entry = cell.recalibrate()
     assert "offsets.csv" in result.warnings[0]
     assert "offsets.csv" in (cell.model_folder(entry.name) / "README.md").read_text()
     assert served.reload() == []
-    followed._in_use.check()
+    followed._in_use.load_if_changed()
     assert served.find_model(None).name == followed.name == entry.name
 
     record_active_export(cell, "none", day(1))

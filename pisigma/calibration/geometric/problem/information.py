@@ -139,7 +139,7 @@ def _row_weights(
 ) -> Float64[Tensor, " poses"]:
     """Compute 1 / standard deviation of every row for a sensor [1/m or 1/rad]; 0 in rows without a value."""
     sensor = problem.sensors[number]
-    distance = view.contributions[number].residual_length[rows] / view.scales[number]
+    distance = view.contributions[number].residual_length[rows] / view.loss_scales[number]
     root = problem.loss_for_sensor(sensor).weight(distance, sensor.components).sqrt()
     root = root / view.variances[number].sqrt()
     if sensor.sigma is not None:

@@ -96,7 +96,7 @@ class ContributionsAndNoise:
         return ContributionsAndNoise(contributions, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
-    def scales(self) -> Float64[Tensor, " sensors"]:
+    def loss_scales(self) -> Float64[Tensor, " sensors"]:
         """Scale of the distances of every sensor, for the loss."""
         return self.noise.clamp(min=ALWAYS_GOOD)
 
@@ -131,7 +131,7 @@ def noise_scales(
     loss: AbstractLoss,
     view: ContributionsAndNoise,
     effective_parameters: Float64[Tensor, " sensors"],
-    refine: bool,
+    use_all_good_rows: bool,
 ) -> Float64[Tensor, " sensors"]:
     """Estimate the standard deviation of every sensor's values, or a factor >= 1 on stated standard deviations.
 
@@ -140,7 +140,7 @@ def noise_scales(
         loss: loss function, which defines the estimators.
         view: residuals and current noise.
         effective_parameters: effective number of parameters per sensor.
-        refine: whether to use all rows without outliers instead of the median.
+        use_all_good_rows: whether to use all rows without outliers instead of the median.
     """
     scales = []
     for k, sensor in enumerate(sensors):
@@ -150,8 +150,8 @@ def noise_scales(
         distance = view.contributions[k].residual_length
         if view.contributions[k].measured_rows < len(distance):
             distance = distance[sensor.present]
-        if refine:
-            scale = loss.sigma(distance, sensor.components, effective_parameters[k], view.scales[k])
+        if use_all_good_rows:
+            scale = loss.sigma(distance, sensor.components, effective_parameters[k], view.loss_scales[k])
         else:
             scale = loss.scale(distance, sensor.components, effective_parameters[k])
         scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
@@ -162,7 +162,7 @@ def rejects_rows(
     sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: ContributionsAndNoise
 ) -> bool:
     """Return whether any loss gives a row a weight of 0."""
-    of_each = zip(sensors, losses, view.contributions, view.scales, strict=True)
+    of_each = zip(sensors, losses, view.contributions, view.loss_scales, strict=True)
     return any(
         bool((loss.weight(part.residual_length / scale, sensor.components) == 0).any())
         for sensor, loss, part, scale in of_each
@@ -203,7 +203,7 @@ def group_variance_ratio(
         ratios.append(ratio)
         if sensor.is_stated:
             continue
-        weight = loss.weight(part.residual_length / view.scales[k], sensor.components) * sensor.present
+        weight = loss.weight(part.residual_length / view.loss_scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
             weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
         square, values = _group_squares(part.residual, weight, pose)

@@ -304,10 +304,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if self.held_directions is not None:
             normal, descent = self.held_directions.restrict(normal, descent, self.step_scale)
         costs = [
-            self.loss_for_sensor(sensor).cost(part.residual_length / view.scales[k], sensor.components).sum()
+            self.loss_for_sensor(sensor)
+            .cost(part.residual_length / view.loss_scales[k], sensor.components)
+            .sum()
             for k, (sensor, part) in enumerate(zip(self.sensors, view.contributions, strict=True))
         ]
-        misfit = (torch.stack(costs) * view.scales.square() / view.variances).sum()
+        misfit = (torch.stack(costs) * view.loss_scales.square() / view.variances).sum()
         rounding = (self._rounding / view.variances).sum()
         cost = misfit + (off * pull).sum()
         return Linearisation(point, cost, descent, normal, misfit, rounding, view)
@@ -371,7 +373,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             root = torch.ones_like(distance)
         else:
             root = (
-                self.loss_for_sensor(sensor).weight(distance / view.scales[number], sensor.components).sqrt_()
+                self.loss_for_sensor(sensor)
+                .weight(distance / view.loss_scales[number], sensor.components)
+                .sqrt_()
             )
         if sensor.sigma is not None:
             root = root / sensor.sigma[rows]

@@ -57,7 +57,7 @@ class CalibrationSetup:
         start: start values of all parameters.
         reference_frames: frames to which bases and tools are relative.
         row_indices: indices of the problem's rows in the measurements, in the order of the problem.
-        unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
+        frame_of_owner: index of every owner's frame, by group of the sensors' unknowns.
         free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
         measurements: the rows of the problem, in the order of the problem.
         joint_repeatability: standard deviation of the value of every revolute joint [rad], relative to the estimated
@@ -68,7 +68,7 @@ class CalibrationSetup:
     start: Float64[Tensor, " parameters"]
     reference_frames: ReferenceFrames
     row_indices: Tensor
-    unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
+    frame_of_owner: Mapping[str, Int64[Tensor, " owners"]]
     free_unknowns: list[int]
     measurements: Measurements
     joint_repeatability: float = 0.0
@@ -375,7 +375,7 @@ def coordinate_jacobian(
     for own in space.unknowns:
         # Shifts of points are also in the axes of their frame's anchor.
         if own.has_point:
-            for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
+            for k, number in enumerate(setup.frame_of_owner[own.name].tolist()):
                 first = space.indices_of(own.name).start + len(own.columns) * k
                 change[first : first + 3, first : first + 3] = reference_frames.bases[number, :3, :3].cpu()
     return change
@@ -388,7 +388,7 @@ def unknowns_in_frames(
     space, bases = setup.problem.space, setup.reference_frames.bases.cpu()
     values = space.sensor_unknowns(point.cpu())
     return {
-        own.name: _moved(bases[setup.unknown_frames[own.name]], values[own.name].t(), own.has_point).numpy()
+        own.name: _moved(bases[setup.frame_of_owner[own.name]], values[own.name].t(), own.has_point).numpy()
         for own in space.unknowns
     }
 

@@ -59,18 +59,21 @@ class ControllerFrames:
 
     Attributes:
         sentence: sentence that states the frames.
-        base: the controller's base frame in the frame of the description's poses, as `FRAME_COLUMNS`.
-        tool: the description's tool relative to the controller's flange.
+        base_in_pose_frame: the controller's base frame in the frame of the description's poses, as `FRAME_COLUMNS`.
+        tool_in_controller_flange: the description's tool relative to the controller's flange.
     """
 
     sentence: str
-    base: Float64[np.ndarray, " 6"]
-    tool: Float64[np.ndarray, " 6"]
+    base_in_pose_frame: Float64[np.ndarray, " 6"]
+    tool_in_controller_flange: Float64[np.ndarray, " 6"]
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for `--json`."""
-        parts = {part: in_file_units(FRAME_COLUMNS, getattr(self, part)) for part in ("base", "tool")}
-        return {"said": self.sentence, **parts}
+        base, tool = (
+            in_file_units(FRAME_COLUMNS, one)
+            for one in (self.base_in_pose_frame, self.tool_in_controller_flange)
+        )
+        return {"said": self.sentence, "base": base, "tool": tool}
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ class Program:
         q: joint values of every stop [rad].
         labels: comment that precedes the move to every stop.
         waits: waiting time at every stop [s]; 0 for none.
-        cartesian: targets, if the program has poses instead of joint values; otherwise None.
+        cartesian_targets: targets, if the program has poses instead of joint values; otherwise None.
         config: configuration of the arm in all poses, if the language requires a configuration; otherwise "".
     """
 
@@ -59,7 +59,7 @@ class Program:
     q: Float64[Tensor, "stops 6"]
     labels: tuple[str, ...]
     waits: tuple[float, ...]
-    cartesian: Targets | None = None
+    cartesian_targets: Targets | None = None
     config: str = ""
 
     @staticmethod
@@ -94,7 +94,7 @@ class Language:
         reserved: words of the language that cannot be names, in capitals.
         line_end: line ending.
         max_lines: largest number of numbered lines of a program; None for any number.
-        keeps_branch: whether Cartesian targets may be on several branches.
+        allows_several_branches: whether Cartesian targets may be on several branches.
         uses_capitals: whether names are written in capitals.
         configuration: pattern of configurations of the arm, if Cartesian targets require a configuration.
         cautions: notes for the user of a program, in addition to those for all languages.
@@ -107,7 +107,7 @@ class Language:
     reserved: frozenset[str]
     line_end: str = "\r\n"
     max_lines: int | None = None
-    keeps_branch: bool = False
+    allows_several_branches: bool = False
     uses_capitals: bool = False
     configuration: re.Pattern[str] | None = None
     cautions: tuple[str, ...] = ()
@@ -142,8 +142,8 @@ class Language:
         Raises:
             OutputError: the program has more lines than the language allows.
         """
-        sentences = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
-        content = {"program": program, "targets": program.cartesian, "cautions": sentences}
+        sentences = [*self.cautions, *(self.cartesian_cautions if program.cartesian_targets else ())]
+        content = {"program": program, "targets": program.cartesian_targets, "cautions": sentences}
         text = _templates().get_template(self.template).render(content) + "\n"
         lines = len(_NUMBERED_LINE.findall(text))
         if self.max_lines is not None and lines > self.max_lines:
@@ -195,7 +195,7 @@ URSCRIPT = Language(
         "struct then thread true while xor movej get_inverse_kin pose_trans set_tcp p speed acceleration frame"
     ),
     line_end="\n",
-    keeps_branch=True,
+    allows_several_branches=True,
     cartesian_cautions=(
         "The controller computes poses with its factory calibration if it has one, not with the nominal robot; joint "
         "targets do not depend on that.",
@@ -310,7 +310,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
     check_program(path, targets.robot, cartesian, config)
     targets.check_complete()
     language = LANGUAGES[path.suffix.lower()]
-    if cartesian and not language.keeps_branch and len(set(targets.branch)) > 1:
+    if cartesian and not language.allows_several_branches and len(set(targets.branch)) > 1:
         other = next(row for row, name in enumerate(targets.branch) if name != targets.branch[0])
         raise OutputError(
             f"the target is on branch {targets.branch[other]} and that of line {targets.line[0]} on branch "

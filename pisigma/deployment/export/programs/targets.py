@@ -33,8 +33,8 @@ class Targets:
         status: status of every pose.
         branch: name of the branch of every target.
         q: corrected joint values [rad or m], NaN without a target.
-        T: pose T_base_tool of the nominal robot at q, `FK_nominal(q)`, NaN without a target. A controller that computes
-            with the nominal robot commands q for this pose.
+        T_nominal: pose T_base_tool of the nominal robot at q, `FK_nominal(q)`, NaN without a target. A controller that
+            computes with the nominal robot commands q for this pose.
         sigma: predicted standard deviation of the reached position [m]; NaN if it is not known.
         remarks: sentences about the model's frames and conditions.
     """
@@ -46,7 +46,7 @@ class Targets:
     status: tuple[Status, ...]
     branch: tuple[str, ...]
     q: Float64[Tensor, "poses dof"]
-    T: Float64[Tensor, "poses 4 4"]
+    T_nominal: Float64[Tensor, "poses 4 4"]
     sigma: Float64[Tensor, " poses"]
     remarks: tuple[str, ...] = ()
 
@@ -128,7 +128,9 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         status=status,
         branch=tuple(solution.branches[index] for index in solution.branch.tolist()),
         q=q,
-        T=forward_kinematics(model.robot, model.robot.to_dh(q)).where(has_target[:, None, None], torch.nan),
+        T_nominal=forward_kinematics(model.robot, model.robot.to_dh(q)).where(
+            has_target[:, None, None], torch.nan
+        ),
         sigma=deviation.double().where(has_target, torch.nan),
         remarks=(*condition_remarks(model), *frame_remarks(model)),
     )

@@ -171,7 +171,7 @@ class ProgramCorrection:
         between = start[:, :3, :3] @ rotation_from_vector(arc.via_angle / arc.angle * _turn(start, end))
         if _LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
             return OTHER_ORIENTATION
-        length = float(arc.angle * arc.radius.norm())
+        length = float(arc.angle * arc.radius_vector.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 
     def waypoints(self, move: PathMove, commanded: CommandedPoses) -> list[Frame] | str:
@@ -276,14 +276,14 @@ class CircularArcs:
 
     Attributes:
         centre: centres of the circles [m].
-        radius: vectors from the centres to the first points [m].
+        radius_vector: vectors from the centres to the first points [m].
         axis: axes of counter-clockwise motion.
         via_angle: angles from the first to the second points [rad].
         angle: angles from the first to the third points [rad], below a full turn.
     """
 
     centre: Points
-    radius: Points
+    radius_vector: Points
     axis: Points
     via_angle: Float64[Tensor, " arcs"]
     angle: Float64[Tensor, " arcs"]
@@ -304,7 +304,10 @@ class CircularArcs:
     def sample(self, steps: int) -> Float64[Tensor, "arcs points 3"]:
         """Return equidistant points along the arcs, from the first to the third points [m]."""
         angles = torch.linspace(0, 1, steps + 1, dtype=torch.float64) * self.angle[:, None]
-        turned = rotation_from_vector(angles[..., None] * self.axis[:, None]) @ self.radius[:, None, :, None]
+        turned = (
+            rotation_from_vector(angles[..., None] * self.axis[:, None])
+            @ self.radius_vector[:, None, :, None]
+        )
         return self.centre[:, None] + turned[..., 0]
 
 

@@ -95,7 +95,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     """
     ends = edge_pixels(detected, board)
     shortest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min(initial=np.inf)
-    half = max(round(_WINDOW * board.clearance * shortest), 2) if len(ends) else 2
+    half = max(round(_WINDOW * board.relative_edge_clearance * shortest), 2) if len(ends) else 2
     start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
     # without smoothing, gradients of a sharp image are biased by some hundredths of a pixel
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), min(_SMOOTHING, half / 4))
@@ -107,7 +107,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     corners, pixels = detected.corner_numbers[inside], pixels[inside]
     axes = _axes_of_squares(board.corners[corners, :2] / board.square, pixels)
     if axes is not None:
-        pixels = fit_saddles(image.astype(np.float64), pixels, axes, _WINDOW * board.clearance)
+        pixels = fit_saddles(image.astype(np.float64), pixels, axes, _WINDOW * board.relative_edge_clearance)
     return DetectedBoard(corners, pixels)
 
 
@@ -129,12 +129,12 @@ class EdgeProfiles:
 
     Attributes:
         points: crossing points on every edge [px].
-        normals: normal vectors of the edges, with half the sampled width as length [px].
+        half_profile_vectors: normal vectors of the edges, with half the sampled width as length [px].
         gray_values: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
     """
 
     points: Float64[np.ndarray, "edges crossings 2"]
-    normals: Float64[np.ndarray, "edges 2"]
+    half_profile_vectors: Float64[np.ndarray, "edges 2"]
     gray_values: Float64[np.ndarray, "edges crossings samples"]
 
     @staticmethod
@@ -170,7 +170,7 @@ class EdgeProfiles:
         blurs only the edges across it, so the third quartile of all edges is returned.
         """
         missing = np.where(_ACROSS < 0, self.gray_values, 1 - self.gray_values).mean((1, 2))
-        blur = 2 * np.linalg.norm(self.normals, axis=1) * missing / np.sqrt(2 / np.pi)
+        blur = 2 * np.linalg.norm(self.half_profile_vectors, axis=1) * missing / np.sqrt(2 / np.pi)
         return float(np.nanquantile(blur, 0.75)) if np.isfinite(blur).any() else np.nan
 
     @property
@@ -180,7 +180,7 @@ class EdgeProfiles:
         Edges without contrast keep their position.
         """
         offset = np.nan_to_num(1 - 2 * self.gray_values.mean(2))
-        points: np.ndarray = self.points + offset[..., None] * self.normals[:, None]
+        points: np.ndarray = self.points + offset[..., None] * self.half_profile_vectors[:, None]
         return points
 
 

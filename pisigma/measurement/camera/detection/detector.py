@@ -197,7 +197,7 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
         if isinstance(flipped, DetectedBoard):
             detected = NoBoard("it is mirrored, as its markers show; do not mirror images", is_mirrored=True)
         return BoardImage(path, size, detected, np.nan)
-    blur = EdgeProfiles.from_image(image, edge_pixels(detected, board), board.clearance).blur
+    blur = EdgeProfiles.from_image(image, edge_pixels(detected, board), board.relative_edge_clearance).blur
     if len(detected.corner_numbers) < MIN_CORNERS:
         reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corner_numbers)}"
     elif blur > max_blur:

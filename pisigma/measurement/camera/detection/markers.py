@@ -41,7 +41,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
         return NoBoard(f"no AprilTag of family {board.dictionary} of the board was found in it")
     tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
     for _ in range(_ITERATIONS):
-        tags = _crossings(image, tags, board.clearance)
+        tags = _crossings(image, tags, board.relative_edge_clearance)
     corners = 4 * number[used, None] + np.arange(4)
     return DetectedBoard(corners.ravel(), tags.reshape(-1, 2))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form.canonical import canonical_rows
 from pisigma.robot.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.robot.kinematics.closed_form.two_link import rounding, solve_two_link, two_link
+from pisigma.robot.kinematics.closed_form.two_link import rounding_tolerance, solve_two_link, two_link
 from pisigma.robot.kinematics.components import Frame, Scalar, as_tensors
 from pisigma.robot.kinematics.tolerances import NEAREST_MARGIN, TILT_TOLERANCE
 
@@ -85,5 +85,5 @@ class Scara(AbstractClosedForm):
         # All axes are parallel, so the angles of the revolute joints add up to that of the tool.
         t_4 = torch.atan2(r_10, r_00) - arm.first - t_2 - rows.theta[2]
         tilt = torch.hypot(r_02, r_12)
-        upright = (tilt <= max(TILT_TOLERANCE, rounding(x.dtype))) & (r_22 > 0)
+        upright = (tilt <= max(TILT_TOLERANCE, rounding_tolerance(x.dtype))) & (r_22 > 0)
         return [arm.first, t_2, d_3, t_4], arm.reached & upright, arm.singular

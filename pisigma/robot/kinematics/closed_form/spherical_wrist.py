@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.robot.kinematics.closed_form.two_link import (
     ARM_BRANCHES,
     first_joint,
-    rounding,
+    rounding_tolerance,
     singular_tolerance,
     solve_first_joint,
     solve_two_link,
@@ -173,7 +173,7 @@ class SphericalWristArm(AbstractClosedForm):
         sine = torch.hypot(m_0[2], m_1[2])
         t_4 = torch.atan2(-m_1[2], -m_0[2])
         # A straight wrist leaves joint 4 free: its joint value is then 0 on the `no_flip` branch.
-        t_4 = torch.where(sine <= rounding(sine.dtype), self.rows.variable_at_zero(3), t_4)
+        t_4 = torch.where(sine <= rounding_tolerance(sine.dtype), self.rows.variable_at_zero(3), t_4)
         cos, sin = torch.cos(t_4), torch.sin(t_4)
         # The row of RotZ(-t_4) · M without t_5 is (s_6, c_6, 0): exact for a straight wrist too.
         t_6 = torch.atan2(cos * m_1[0] - sin * m_0[0], cos * m_1[1] - sin * m_0[1])

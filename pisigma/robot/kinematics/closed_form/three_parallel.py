@@ -16,7 +16,7 @@ from pisigma.robot.kinematics.closed_form.two_link import (
     ARM_BRANCHES,
     TwoLink,
     first_joint,
-    rounding,
+    rounding_tolerance,
     singular_tolerance,
     solve_first_joint,
     solve_two_link,
@@ -165,7 +165,7 @@ class ThreeParallelArm(AbstractClosedForm):
         # The plane's y axis points up; see `three_parallel_branches` for the sign.
         upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
         arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
-        free = (straight <= rounding(x.dtype)) & ~arm.reached
+        free = (straight <= rounding_tolerance(x.dtype)) & ~arm.reached
         if free.any():
             t_6 = torch.where(free, self._turned_wrist(t_234, t_5, t_6, x, y), t_6)
             arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
@@ -181,7 +181,9 @@ class ThreeParallelArm(AbstractClosedForm):
         x, y, z = (sin * R[j][0] - cos * R[j][1] for j in range(3))
         sine = torch.hypot(x, y)
         t_6 = torch.where(
-            sine <= rounding(x.dtype), self.rows.variable_at_zero(5), torch.atan2(-wrist * y, wrist * x)
+            sine <= rounding_tolerance(x.dtype),
+            self.rows.variable_at_zero(5),
+            torch.atan2(-wrist * y, wrist * x),
         )
         return wrist * torch.atan2(sine, z), t_6, sine
 

@@ -28,7 +28,7 @@ def singular_tolerance(dtype: torch.dtype) -> float:
     return max(SINGULAR_TOLERANCE, 100 * torch.finfo(dtype).eps)
 
 
-def rounding(dtype: torch.dtype) -> float:
+def rounding_tolerance(dtype: torch.dtype) -> float:
     """Return the relative size below which a cosine beyond 1 or a length is a rounding error (1.1e-13 in float64)."""
     return ROUNDING_UNITS * torch.finfo(dtype).eps
 
@@ -51,7 +51,13 @@ class TwoLink:
 
 
 def solve_first_joint(
-    x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float, margin: float
+    x: Tensor,
+    y: Tensor,
+    side: float,
+    scale: float,
+    shoulder: Scalar,
+    azimuth_when_free: float,
+    min_squared_distance_share: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Solve joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
 
@@ -61,17 +67,17 @@ def solve_first_joint(
         side: distance of the point to the left of the arm's plane [m].
         scale: length of the arm [m], to which rounding errors are relative.
         shoulder: +1 for a point ahead of axis 1, -1 for one behind it; broadcasts.
-        free: azimuth [rad] to use for a point on axis 1, for which it is arbitrary.
-        margin: smallest square of the distance ahead of axis 1, as a share of the squared scale.
+        azimuth_when_free: azimuth [rad] to use for a point on axis 1, for which it is arbitrary.
+        min_squared_distance_share: smallest square of the distance ahead of axis 1, as a share of the squared scale.
 
     Returns:
         The angle [rad], the distance of the point ahead of axis 1 in the plane [m], and whether a solution exists.
     """
     square = x * x + y * y - side * side
-    reached = square >= -rounding(x.dtype) * scale * scale
-    ahead = shoulder * square.clamp(min=margin * scale * scale).sqrt()
-    on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
-    azimuth = torch.where(on_axis, free, torch.atan2(y, x))
+    reached = square >= -rounding_tolerance(x.dtype) * scale * scale
+    ahead = shoulder * square.clamp(min=min_squared_distance_share * scale * scale).sqrt()
+    on_axis = torch.hypot(x, y) <= rounding_tolerance(x.dtype) * scale
+    azimuth = torch.where(on_axis, azimuth_when_free, torch.atan2(y, x))
     angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
     # On axis 1 `ahead` is 0 or -0, and atan2 of two rounding errors is arbitrary; the back branch is half a turn
     # from the azimuth.
@@ -80,7 +86,7 @@ def solve_first_joint(
 
 
 def solve_two_link(
-    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float, margin: float
+    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float, cosine_margin: float
 ) -> TwoLink:
     """Solve the angles of two links that end at a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
 
@@ -91,18 +97,18 @@ def solve_two_link(
         b: length of the second link [m], positive.
         elbow_sign: +1 or -1, the sign of the sine of the elbow angle; broadcasts.
         first_when_free: first angle [rad] to use for a point on the first axis, for which it is arbitrary.
-        margin: distance that the cosine of the elbow angle keeps from 1.
+        cosine_margin: distance that the cosine of the elbow angle keeps from 1.
 
     Returns:
         The angles. For a point out of reach the arm is as near to it as possible and `reached` is False. A cosine
         that exceeds 1 by rounding is treated as 1.
     """
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
-    reached = cosine.abs() <= 1 + rounding(x.dtype)
-    cosine = cosine.clamp(margin - 1, 1 - margin)
+    reached = cosine.abs() <= 1 + rounding_tolerance(x.dtype)
+    cosine = cosine.clamp(cosine_margin - 1, 1 - cosine_margin)
     # (1 - c)(1 + c) is accurate near a stretched arm, where 1 - c² suffers from cancellation.
     sine = elbow_sign * ((1 - cosine) * (1 + cosine)).sqrt()
-    on_axis = torch.hypot(x, y) <= rounding(x.dtype) * (abs(a) + b)
+    on_axis = torch.hypot(x, y) <= rounding_tolerance(x.dtype) * (abs(a) + b)
     # Angle from the first link to the line to the point.
     free = torch.atan2(b * sine, a + b * cosine)
     first = torch.where(on_axis, first_when_free, torch.atan2(y, x) - free)

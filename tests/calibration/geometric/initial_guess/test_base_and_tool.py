@@ -194,7 +194,7 @@ def test_a_base_that_only_outliers_show_has_no_standard_error(seed: int) -> None
     assert len(result.outliers) >= 2
     row = result.parameter("base_G_x")
     assert not row.free
-    assert row.label == "outliers"
+    assert row.short_remark == "outliers"
     assert result.parameter("base_F_x").free
 
 

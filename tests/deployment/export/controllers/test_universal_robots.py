@@ -138,7 +138,7 @@ def test_described_arms_agree_with_the_maker_in_its_frames(name, file):
     )
     assert own.model.lower() == name
     turned = name in ("ur3", "ur3e", "ur5e")
-    assert_close(own.frames().base, [0, 0, 0, np.pi if turned else 0, 0, 0], atol=1e-12)
+    assert_close(own.frames().base_in_pose_frame, [0, 0, 0, np.pi if turned else 0, 0, 0], atol=1e-12)
     assert file is universal_robots.FILE or f"calib_{calib}" in text
 
 

@@ -39,7 +39,9 @@ def test_the_real_tool_remains_on_the_arc(suffix, arm, tmp_path):
         commanded[:, :3, 3] = CircularArcs.through_points(*ends).sample(8)[0]
         real = attained_poses(arm, commanded, commanded)[:, :3, 3] - meant.centre
         height = (real * meant.axis).sum(-1)
-        off = torch.hypot(height, (real - height[:, None] * meant.axis).norm(dim=-1) - meant.radius.norm())
+        off = torch.hypot(
+            height, (real - height[:, None] * meant.axis).norm(dim=-1) - meant.radius_vector.norm()
+        )
         worst = max(worst, float(off.max()) * 1e3)
     assert worst < 1.5 * TOLERANCE_MM
     last = attained_poses(arm, moves[-1].end.pose.T[None], T[2:])

@@ -52,5 +52,7 @@ def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
 def test_the_blur_of_edges(blur: float) -> None:
     R, t = view(BOARD, 0.3, (0.4, 0.3, 0.0))
     ends = CAMERA.project(BOARD.corners @ R.T + t)[0][BOARD.edges]
-    profiles = EdgeProfiles.from_image(draw_board(BOARD, R, t, blur=blur), ends, BOARD.clearance)
+    profiles = EdgeProfiles.from_image(
+        draw_board(BOARD, R, t, blur=blur), ends, BOARD.relative_edge_clearance
+    )
     assert_close(profiles.blur, np.hypot(blur, 0.5), rtol=0.05)

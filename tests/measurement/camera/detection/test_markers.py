@@ -33,7 +33,7 @@ def test_corners_of_a_whole_board_and_of_a_piece(board, detect, largest) -> None
     assert_close(
         np.sqrt(np.square(whole.pixels - true[whole.corner_numbers]).mean()), 0.0, atol=largest / 2.5
     )
-    profiles = EdgeProfiles.from_image(image, edge_pixels(whole, board), board.clearance)
+    profiles = EdgeProfiles.from_image(image, edge_pixels(whole, board), board.relative_edge_clearance)
     assert_close(profiles.blur, np.hypot(0.8, 0.4), rtol=0.25)
     t[0] -= 0.15  # so that a part of the board is outside
     piece, true = detect(draw_board(board, R, t), board), CAMERA.project(board.corners @ R.T + t)[0]
