@@ -368,7 +368,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     view = contributions_and_noise_of(here)
     used = effective_parameters_by_sensor(view, covariance_of(here.normal)).tolist()
     for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
-        if sensor.is_stated:
+        if sensor.are_values_given:
             continue
         sigma = float(view.noise[k])
         unit = sensor.unit if sensor.sigma is None else "stated"

@@ -171,7 +171,7 @@ class HybridCalibrator:
             geometry=with_aligned_frames(solved, refined),
             correction=refined.correction,
             coverage=JointCoverage.from_joints(self.geometric_calibrator.robot, solved.problem.q),
-            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.is_stated},
+            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.are_values_given},
             unknowns=refined.design.unknowns,
             effective_unknowns=refined.posterior.effective_unknowns,
             rounds=refined.rounds,

@@ -217,7 +217,7 @@ def sensor_values(
                 residual=r.contiguous(),
                 weight_root=root,
                 has_stated_noise=sensor.sigma is not None,
-                are_values_given=sensor.is_stated,
+                are_values_given=sensor.are_values_given,
                 other_row=row + 1 if paired else None,
                 other_joint_derivatives=other * direction if paired else None,
             )

@@ -122,7 +122,7 @@ def select_arm_rows(
 
 def mean_robot(
     name: str,
-    posterior: RobotPosterior,
+    nominal_prior: RobotPosterior,
     population: Population,
     fleet: Sequence[Measurements],
     noise: CalibrationNoise,
@@ -131,12 +131,12 @@ def mean_robot(
 
     Args:
         name: name of the model.
-        posterior: prior of the nominal robot, with the unknowns of the population.
+        nominal_prior: prior of the nominal robot, with the unknowns of the population.
         population: errors of the robots.
         fleet: rows of robots, which define the measured joint values.
         noise: noise of each sensor, see `Adaptation.noise`.
     """
-    usual, size = posterior.uncertainty, population.geometric_count
+    usual, size = nominal_prior.uncertainty, population.geometric_count
     space, nominal = usual.space, usual.space.robot
     dh = nominal.dh + population.mean[:size].numpy().reshape(nominal.dh.shape)
     mean = nominal.with_geometry(dh=dh)

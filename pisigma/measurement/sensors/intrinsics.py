@@ -209,7 +209,7 @@ class IntrinsicsSensor(AbstractSensor):
     name = "intrinsics"
     unit = "m"
     components = NUMBERS
-    is_stated = True
+    are_values_given = True
     determines_frame = False
     owner: Int64[Tensor, " rows"]
     information_root: Float64[Tensor, "9 9 rows"]
@@ -295,7 +295,7 @@ class BoardScaleSensor(AbstractSensor):
     name = "board scale"
     unit = "m"
     components = 1
-    is_stated = True
+    are_values_given = True
     determines_frame = False
     owner: Int64[Tensor, " rows"]
     weight: Float64[Tensor, " rows"]

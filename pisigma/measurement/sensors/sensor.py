@@ -161,8 +161,8 @@ class AbstractSensor(ABC):
         unit: unit of the values.
         components: number of values per row.
         depends_on_rotation: whether the predicted values depend on the tool's rotation.
-        is_stated: whether the values are stated rather than measured, so that their standard deviation is not estimated
-            and they are never outliers.
+        are_values_given: whether the values are stated rather than measured, so that their standard deviation is not
+            estimated and they are never outliers.
         is_paired: whether a value belongs to a row and the next one.
         determines_frame: whether the values determine the position of the frame in which the sensor measures.
         readings: columns that the sensor adds to measurement files; None for a sensor whose values are fields of
@@ -175,7 +175,7 @@ class AbstractSensor(ABC):
     unit: ClassVar[Literal["m", "rad"]]
     components: ClassVar[int]
     depends_on_rotation: ClassVar[bool] = False
-    is_stated: ClassVar[bool] = False
+    are_values_given: ClassVar[bool] = False
     is_paired: ClassVar[bool] = False
     determines_frame: ClassVar[bool] = True
     readings: ClassVar[SensorReadings | None] = None

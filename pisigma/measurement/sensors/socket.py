@@ -139,7 +139,7 @@ class SocketDistanceSensor(AbstractSensor):
     name = "socket distance"
     unit = "m"
     components = 1
-    is_stated = True
+    are_values_given = True
     determines_frame = False
     first: Int64[Tensor, " rows"]
     second: Int64[Tensor, " rows"]

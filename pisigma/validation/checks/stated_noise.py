@@ -32,7 +32,7 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         contributions_and_noise_of(solved.refined_linearisation).contributions,
         strict=True,
     ):
-        if sensor.sigma is None or sensor.is_stated or sensor.components not in _CHI_MEDIAN:
+        if sensor.sigma is None or sensor.are_values_given or sensor.components not in _CHI_MEDIAN:
             continue
         distance = part.residual_length[sensor.present]
         ratio = float(distance.median()) / _CHI_MEDIAN[sensor.components]

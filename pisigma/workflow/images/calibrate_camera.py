@@ -13,7 +13,7 @@ from pisigma.files.output_file import check_page, write_atomically
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard
-from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, fit_board_poses
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.solved_images import (
     BoardView,
@@ -175,7 +175,7 @@ def calibrate_camera(
     boards = [one.board for one in detected if isinstance(one.board, DetectedBoard)]
     views = [BoardView(of_board.corners[one.corner_numbers], one.pixels) for one in boards]
     calibration = calibrate_intrinsics(views, settings.name, size, settings.free_k3)
-    return CameraCalibration(calibration, predict_boards(detected, calibration.camera, of_board))
+    return CameraCalibration(calibration, fit_board_poses(detected, calibration.camera, of_board))
 
 
 def _row(name: str, value: float, sigma: float, unit: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.files.output_file import check_page, write_atomically
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, fit_board_poses
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.detection.video import is_frame, is_video
 from pisigma.measurement.csv.columns import find_column
@@ -167,7 +167,7 @@ def detect(
     joined = None if joints is None else join_joint_values(names, joints, settings.within, stops)
     detected = detect_boards(files, of_board, settings.max_blur, progress)
     result = DetectedCorners(
-        predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)
+        fit_board_poses(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)
     )
     if len(result.rows) == 1:
         raise MeasurementError(

@@ -133,7 +133,7 @@ def residual_sizes(
     for sensor, part in zip(
         problem.sensors, contributions_and_noise_of(linearisation).contributions, strict=True
     ):
-        if sensor.unit == "m" and not sensor.is_stated:
+        if sensor.unit == "m" and not sensor.are_values_given:
             size = part.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)
     return sizes

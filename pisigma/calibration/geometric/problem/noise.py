@@ -144,7 +144,7 @@ def noise_scales(
     """
     scales = []
     for k, sensor in enumerate(sensors):
-        if sensor.is_stated:
+        if sensor.are_values_given:
             scales.append(torch.ones_like(effective_parameters[k]))
             continue
         distance = view.contributions[k].residual_length
@@ -201,7 +201,7 @@ def group_variance_ratio(
     for k, (sensor, part) in enumerate(zip(sensors, view.contributions, strict=True)):
         ratio = torch.ones_like(effective_parameters[k])
         ratios.append(ratio)
-        if sensor.is_stated:
+        if sensor.are_values_given:
             continue
         weight = loss.weight(part.residual_length / view.loss_scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
@@ -241,8 +241,8 @@ def angle_variance_factor(
         prior_precision: prior precision of every free parameter.
         prior_gradient: contribution of the prior to the right-hand side of the normal equations.
     """
-    angular = [sensor.unit == "rad" and not sensor.is_stated for sensor in sensors]
-    lengths = [sensor.unit != "rad" and not sensor.is_stated for sensor in sensors]
+    angular = [sensor.unit == "rad" and not sensor.are_values_given for sensor in sensors]
+    lengths = [sensor.unit != "rad" and not sensor.are_values_given for sensor in sensors]
     if not any(angular) or not any(lengths):
         return torch.ones_like(view.noise)
     variance = view.noise.square() * view.repeat_variance_factor

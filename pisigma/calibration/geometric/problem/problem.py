@@ -245,7 +245,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def loss_for_sensor(self, sensor: AbstractSensor) -> AbstractLoss:
         """Return the loss function of a sensor."""
-        return _CERTAIN_LOSS if sensor.is_stated else self.loss
+        return _CERTAIN_LOSS if sensor.are_values_given else self.loss
 
     def chunks(self) -> list[slice]:
         """Return the rows in chunks that are processed together."""

@@ -115,8 +115,8 @@ def rms_of(residual: Float64[np.ndarray, "*corners 2"]) -> float:
     return float(np.sqrt(np.square(residual).mean()))
 
 
-def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -> DetectedBoards:
-    """Predict corners from the pose of the board in every image, and drop images for which no pose fits.
+def fit_board_poses(images: Sequence[BoardImage], camera: Camera, board: Board) -> DetectedBoards:
+    """Fit the pose of the board in every image, predict its corners, and drop images for which no pose fits.
 
     Raises:
         MeasurementError: the size of an image differs from that of the camera's images.
