@@ -12,7 +12,7 @@ from pisigma.joint_correction.conditions import with_modelled_torques
 from pisigma.joint_correction.feature import angle_per_joint_value, scaled_joints
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.stated_conditions import condition_warnings
+from pisigma.model.frame_choice import warnings_without_rows
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
 from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
@@ -53,7 +53,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], model_fo
         joints=joints,
         name=model.name,
         model_folder_hash=model_folder_hash,
-        warnings=condition_warnings(model),
+        warnings=warnings_without_rows(model),
     )
 
 

@@ -14,7 +14,7 @@ from pisigma.lifetime.cell.controller import checked_model_folder
 from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.inverse.corrected_ik import load as load_folder
+from pisigma.model.inverse.loading import load as load_folder
 from pisigma.model.inverse.solution import Solution
 from pisigma.robot.kernels.array_kinematics import transform_of
 from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE

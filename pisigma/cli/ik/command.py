@@ -31,14 +31,18 @@ ToleranceMm = Annotated[
 ToleranceDeg = Annotated[
     str | None, typer.Option(help="Tolerance about the axes of the tool [deg], one number or three.")
 ]
-ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of an arm with seven joints [deg].")]
+Target = Annotated[str | None, typer.Option(help="Target of the poses. [default: the first]")]
+Frame = Annotated[str | None, typer.Option(help="Frame of the poses. [default: the first]")]
+ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of a seven-joint arm [deg].")]
 
 
 def ik(
     model: ModelOrCell,
     pose: Annotated[
         Pose | None,
-        typer.Option(help="X Y Z ROLL PITCH YAW of the tool in the frame of the measurements [mm, deg]."),
+        typer.Option(
+            help="X Y Z ROLL PITCH YAW of a measured target in a frame of the measurements [mm, deg]."
+        ),
     ] = None,
     poses: Annotated[
         Path | None,
@@ -70,6 +74,8 @@ def ik(
     tolerance_mm: ToleranceMm = None,
     tolerance_deg: ToleranceDeg = None,
     elbow_deg: ElbowDeg = None,
+    target: Target = None,
+    frame: Frame = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -85,7 +91,7 @@ def ik(
             raise typer.BadParameter("the option applies only to --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
     from pisigma.lifetime.cell.controller import checked_model_folder
-    from pisigma.model.inverse.corrected_ik import load
+    from pisigma.model.inverse.loading import load
 
     if out is not None:
         check_output(out, inputs=(model, poses))
@@ -96,6 +102,8 @@ def ik(
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)
+    if target is not None or frame is not None:
+        solver = solver.for_target(target, frame=frame)
     solver = _for_task(solver, ignore_axes, tolerance_mm, tolerance_deg, elbow_deg)
     if poses is not None and out is not None:
         _write_file(solver, poses, out, branch, accuracy, path, as_json)

@@ -119,7 +119,7 @@ def _stream(settings: ServeSettings, file: Path, model: Path | None) -> None:
     from pisigma.deployment.export.rsi import RsiAddress
     from pisigma.deployment.serve.rsi import RsiServer
     from pisigma.lifetime.cell.controller import checked_model_folder
-    from pisigma.model.inverse.corrected_ik import load
+    from pisigma.model.inverse.loading import load
 
     if model is None:
         raise typer.BadParameter("expected a model folder or a cell", param_hint="'MODEL'")

@@ -7,6 +7,7 @@ from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.files.errors import ModelError, OutputError, check_choice
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.frame_choice import several_names
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.robot.description import Robot
 
@@ -122,11 +123,11 @@ def geometry_remarks(model: CalibratedModel) -> tuple[str, ...]:
 
 def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """Return remarks that state which base and tool are exported if the model has several."""
-    several = (("base", "frame", list(model.bases)), ("tool", "target", list(model.tools)))
+    parts = {"frame": "base", "target": "tool"}
     return tuple(
-        f"The {part} is that of the {what} '{names[0]}'; the model has {len(names)} {what}s ({', '.join(names)})."
-        for part, what, names in several
-        if len(names) > 1
+        f"The {parts[kind]} is that of the {kind} '{names[0]}'; the model has {len(names)} {kind}s "
+        f"({', '.join(names)})."
+        for kind, names in several_names(model)
     )
 
 

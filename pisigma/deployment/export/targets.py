@@ -26,7 +26,7 @@ from pisigma.files.errors import OutputError, Phrase, Place, check_choice
 from pisigma.files.input_file import read_input
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.inverse.corrected_ik import load
+from pisigma.model.inverse.loading import load
 from pisigma.planning.plan_file import joint_columns
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 

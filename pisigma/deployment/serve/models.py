@@ -21,7 +21,8 @@ from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.lifetime.cell.status import status_of
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.loading import load
 from pisigma.model.inverse.solution import Solution
 
 

@@ -1,17 +1,14 @@
 """Corrected inverse kinematics: joint values at which the real robot reaches a pose."""
 
-import os
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.files.errors import ModelError, Place, PoseError
-from pisigma.files.model_files import COMPILED, compiled_model_hash, model_hash
+from pisigma.files.errors import ModelError, PoseError
 from pisigma.model.inverse.joint_input import PlausibleJoints, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import call_model, is_tensor
@@ -42,7 +39,8 @@ class CorrectedIK(AbstractInverse):
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
-        warnings: warnings about conditions given to `under` outside the range of the calibration, or modelled torques.
+        warnings: warnings about conditions given to `under` outside the range of the calibration, modelled torques, or
+            several targets or frames of which only the first is used.
         controller_solver: conversion to the controller's values for coupled joints; None if there are none.
     """
 
@@ -54,15 +52,15 @@ class CorrectedIK(AbstractInverse):
         Raises:
             ModelError: the model states unknown branches of its robot, or no initial values for the numeric inverse.
         """
+        from pisigma.model.frame_choice import warnings_without_rows
         from pisigma.model.inverse.numeric_ik import NUMERIC, NumericIK
-        from pisigma.model.stated_conditions import condition_warnings
 
         route = NumericIK(model)
         self.name, self.branches, self.branch_order = model.name, route.branches, route.branch_order
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
-        self.warnings = condition_warnings(model)
+        self.warnings = warnings_without_rows(model)
         self.model, self.numeric = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
         self.controller_solver = None
@@ -263,7 +261,29 @@ class CorrectedIK(AbstractInverse):
         """
         from pisigma.model.stated_conditions import under_stated_conditions
 
-        return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
+        return self._with_model(under_stated_conditions(self.model, payload_kg, temperature_c))
+
+    def for_target(self, target: str | None = None, *, frame: str | None = None) -> "CorrectedIK":
+        """Return the corrected inverse kinematics for poses of another target, or in another frame.
+
+        Args:
+            target: name of a target of the calibration rows; None for the current one, at first that of the first row.
+            frame: name of a frame of the calibration rows; None for the current one.
+
+        Raises:
+            ModelError: the model was not calibrated for this target or frame.
+        """
+        from pisigma.model.frame_choice import with_frame_and_target
+
+        return self._with_model(with_frame_and_target(self.model, frame, target))
+
+    def _with_model(self, model: "pisigma.model.calibrated_model.CalibratedModel") -> "CorrectedIK":
+        """Return the inverse kinematics of a variant of the model, for the same task and with warnings of the cell."""
+        from pisigma.model.frame_choice import warnings_without_rows
+
+        ik, of_model = CorrectedIK(model), warnings_without_rows(self.model)
+        ik.warnings += tuple(warning for warning in self.warnings if warning not in of_model)
+        return ik if self.task_axes == ik.task_axes else ik.with_axes(self.task_axes)
 
     def accuracy(self, q: Any, *, approach: Any = None) -> Any:
         """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`; see `__call__`.
@@ -355,46 +375,3 @@ class CorrectedIK(AbstractInverse):
 
         tensors = replace(solution.map(as_tensor), owner=self)
         return in_type_of_poses(tensors, poses, self.model if poses.requires_grad else None, axes)
-
-
-def load(folder: str | os.PathLike[str]) -> CorrectedIK:
-    """Load a model folder as corrected inverse kinematics.
-
-    Args:
-        folder: folder that `pisigma calibrate` or `pisigma train` wrote.
-
-    Raises:
-        ModelError: the folder is not a complete model; the message names the faulty file.
-    """
-    path = Path(folder)
-    kernels = _stored_kernels(path)
-    if kernels is None:
-        from pisigma.model.folder.model_folder import load_model
-
-        return CorrectedIK(load_model(path))
-    stated = model_hash(path)
-
-    def read() -> "pisigma.model.calibrated_model.CalibratedModel":
-        from pisigma.model.folder.model_folder import load_model
-
-        if model_hash(path) != stated:
-            raise ModelError(
-                "the model has been changed since it was loaded", at=Place(path), remedy="load it again"
-            )
-        return load_model(path)
-
-    return CorrectedIK._of_kernels(kernels, read)
-
-
-def _stored_kernels(path: Path) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-    """Return the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
-    stated = compiled_model_hash(path)
-    if stated is None:
-        return None
-    from pisigma.model.inverse.compiled_ik import CompiledIK
-
-    try:
-        kernels = CompiledIK.load(path / COMPILED)
-    except ModelError:
-        return None
-    return kernels if kernels.belongs_to == stated else None

@@ -11,7 +11,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.loading import load
 
 _PROBES = 20
 """Number of joint vectors at which the model in memory and the model in the folder are compared."""

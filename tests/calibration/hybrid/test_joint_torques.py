@@ -27,7 +27,8 @@ from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.loading import load
 from pisigma.model.stated_conditions import condition_warnings, under_stated_torques
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics

@@ -13,7 +13,7 @@ from testing.pose_files import COLUMNS, write_poses
 from testing.screens import assert_screen
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, PoseError
-from pisigma.model.inverse.corrected_ik import load
+from pisigma.model.inverse.loading import load
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import xyz_zyx_from_transform

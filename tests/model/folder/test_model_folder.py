@@ -20,7 +20,7 @@ from pisigma.files.errors import ModelError
 from pisigma.files.model_files import check_model_hash
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.inverse.corrected_ik import load
+from pisigma.model.inverse.loading import load
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 PROVENANCE = Provenance(

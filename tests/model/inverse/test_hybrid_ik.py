@@ -13,7 +13,8 @@ from pisigma.model.accuracy import position_accuracy
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.inverse.compiled_ik import MAX_SOLUTIONS
-from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.loading import load
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.status import Status

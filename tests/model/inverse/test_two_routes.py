@@ -16,7 +16,8 @@ from pisigma.files.errors import ModelError, PoseError
 from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, compiled_model_hash
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
-from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.loading import load
 from pisigma.model.inverse.solution import Solution
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.status import Status
