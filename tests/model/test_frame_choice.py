@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from testing.closeness import assert_close
 
 import pisigma
 from pisigma.files.errors import ModelError
@@ -40,10 +41,10 @@ def test_poses_of_every_target(folder: Path, model: CalibratedModel) -> None:
     for name in ("A", "B", "C"):
         of_target = ik.for_target(name)
         T = of_target.forward(Q)
-        np.testing.assert_allclose(T, poses_of_rows(model, row(target=name))[0], atol=1e-14)
-        np.testing.assert_allclose(of_target(T, near=Q).q, Q, atol=1e-9)
+        assert_close(T, poses_of_rows(model, row(target=name))[0], atol=1e-14)
+        assert_close(of_target(T, near=Q).q, Q, atol=1e-9)
         expected = float(sigma_of_rows(model, row(target=name)).norm())
-        assert float(of_target.accuracy(Q)) == pytest.approx(expected, rel=1e-12)
+        assert_close(float(of_target.accuracy(Q)), expected, rtol=1e-12)
         assert of_target.warnings == ()
 
 
@@ -54,7 +55,7 @@ def test_poses_in_every_frame(model: CalibratedModel) -> None:
     assert len(ik.warnings) == 2
     for name in ("", "moved"):
         T = ik.for_target("C", frame=name).forward(Q)
-        np.testing.assert_allclose(T, poses_of_rows(ik.model, row(name, "C"))[0], atol=1e-14)
+        assert_close(T, poses_of_rows(ik.model, row(name, "C"))[0], atol=1e-14)
 
 
 def test_the_task_is_kept(model: CalibratedModel) -> None:
