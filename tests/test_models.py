@@ -16,7 +16,7 @@ import pisigma
 from pisigma.model.folder.model_folder import load_model
 from pisigma.network.pairs import build_pairs
 from pisigma.reporting.tables import joint_table
-from pisigma.validation.held_out.training_summary import JointErrorFigures, TrainingSummary
+from pisigma.validation.held_out.training_summary import AbsoluteJointErrorFigures, TrainingSummary
 from pisigma.workflow.recipes.data import simulate
 from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
 from pisigma.workflow.recipes.recipe import SimulatedData
@@ -144,7 +144,7 @@ def test_figures_are_reproduced(folder, repository):
         for joint in model.metrics["joints"]:
             index = names.index(joint["name"])
             for when, errors in (("before", before), ("after", after)):
-                found = JointErrorFigures.from_errors(errors[:, index], model.robot.revolute[index])
+                found = AbsoluteJointErrorFigures.from_errors(errors[:, index], model.robot.revolute[index])
                 for name, value in joint[part][when].items():
                     assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-9)
 

@@ -51,9 +51,11 @@ def _parameter_row(parameter: ParameterFigures) -> tuple[str, ...]:
         error is not None and parameter.change is not None and abs(parameter.change) < _SIGNIFICANT * error
     )
     label = (
-        ", ".join([*(() if parameter.label == "identified" else (parameter.label,)), _UNCERTAIN])
+        ", ".join(
+            [*(() if parameter.short_remark == "identified" else (parameter.short_remark,)), _UNCERTAIN]
+        )
         if small
-        else parameter.label
+        else parameter.short_remark
     )
     return (parameter.name, parameter.unit, *texts, label)
 
@@ -78,7 +80,7 @@ def _scale(scale: ScaleFigures) -> str:
         "be distinguished from a sensor whose scale is off by that factor, because both give the same held-out "
         "errors. The "
         f"odds are {scale.odds:.2g} to 1 for one common factor rather than an error of each link; if the scale "
-        f"is off, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to all errors shown"
+        f"is off, true positions are off by {scale.rms_mm_if_sensor_error:.2g} mm RMS in addition to all errors shown"
     )
 
 

@@ -85,7 +85,7 @@ def _accuracy(summary: CalibrationSummary) -> str:
             f"{rounded_text(summary.predicted_rms_mm, 0)} mm RMS at other poses{scatter}, as predicted from the "
             "uncertainty of the calibration; no row was held out."
         )
-    figures = figures or summary.calibrated
+    figures = figures or summary.training_errors
     if figures is None or not figures.models:
         return "not known, because no row was judged."
     (first, nominal), *_ = figures.models.items()
@@ -132,7 +132,7 @@ def scale_matters(summary: CalibrationSummary, odds: float = _LIKELY_SCALE) -> b
     if scale is None or judged is None or scale.odds < odds:
         return False
     *_, best = judged.models.values()
-    return best.rms_mm is not None and scale.rms_mm >= _MIN_SCALE_SHARE * best.rms_mm
+    return best.rms_mm is not None and scale.rms_mm_if_sensor_error >= _MIN_SCALE_SHARE * best.rms_mm
 
 
 def scale_text(scale: ScaleFigures) -> str:
@@ -148,8 +148,8 @@ def scale_text(scale: ScaleFigures) -> str:
 def scale_error_text(scale: ScaleFigures) -> str:
     """Return a sentence on the consequence of a wrong scale of the sensor."""
     return (
-        f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to the "
-        "errors shown; check it with a scale bar."
+        f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm_if_sensor_error:.2g} mm RMS in "
+        "addition to the errors shown; check it with a scale bar."
     )
 
 
@@ -214,9 +214,11 @@ def _learned(summary: CalibrationSummary) -> Iterator[Block]:
 
 def _fit(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the errors of the calibration rows, and how the search ended."""
-    if summary.calibrated is not None:
-        what = f"errors of the rows used in the calibration, {held_out_text(summary.calibrated, summary)}"
-        yield table_block(what, *error_table(summary.calibrated), "errors of the fit")
+    if summary.training_errors is not None:
+        what = (
+            f"errors of the rows used in the calibration, {held_out_text(summary.training_errors, summary)}"
+        )
+        yield table_block(what, *error_table(summary.training_errors), "errors of the fit")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     line = f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."

@@ -204,7 +204,7 @@ def arms_text(
     warnings = (*(one.sentence for one in summary.diagnostics), *warnings)
     rows = [row for one in summary.bases for row in base_rows(one)]
     shared = [
-        (one.kind, one.name, " and ".join(one.arms), rounded_text(one.distance_mm, 0))
+        (one.kind, one.name, " and ".join(one.arms), rounded_text(one.largest_disagreement_mm, 0))
         for one in summary.shared
     ]
     arms = [

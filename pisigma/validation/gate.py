@@ -185,7 +185,7 @@ def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
             kind="row_order",
             severity="implausible",
             sentence=str(moved),
-            rows=(str(Place(rows.source, moved.line)),),
+            row_places=(str(Place(rows.source, moved.line)),),
             cause="frame",
             values={} if moved.line is None else {"first_line": moved.line},
             remedy=moved.remedy,

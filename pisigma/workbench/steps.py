@@ -149,7 +149,7 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 def wrong_rows_by_sentence(findings: Sequence[Diagnostic]) -> dict[str, str]:
     """Return the wrong rows by the sentences of the findings."""
-    return {one.sentence: "; ".join(one.rows) for one in findings if one.rows}
+    return {one.sentence: "; ".join(one.row_places) for one in findings if one.row_places}
 
 
 def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:

@@ -197,7 +197,7 @@ class Tabs:
         fields = {
             sentence: repaired_fields(incoming, repair) for sentence, repair in repairs.items() if repair
         }
-        lines = {line for one in diagnostics for line in line_numbers_in(" ".join(one.rows))}
+        lines = {line for one in diagnostics for line in line_numbers_in(" ".join(one.row_places))}
         tables = []
         for mapping in () if problem else incoming.proposal.mappings:
             rows = sorted(

@@ -70,7 +70,7 @@ class UploadedRowsHandler:
             except PisigmaError as problem:
                 return self._uploads.without_folder(self._tabs.render_findings(incoming, (), str(problem)))
             self._scene.mark_rows_of_lines(
-                line_numbers_in(" ".join(row for one in found for row in one.rows))
+                line_numbers_in(" ".join(row for one in found for row in one.row_places))
             )
             return self._uploads.without_folder(self._tabs.render_findings(incoming, found))
 

@@ -96,7 +96,7 @@ class Calibration(AbstractModelResult):
     @property
     def held_out_p95_and_best_known_rms_mm(self) -> tuple[float | None, float | None]:
         """95 % quantile and RMS of the position errors [mm]; see `AbstractModelResult`."""
-        judged, fitted = self.summary.validation_errors, self.summary.calibrated
+        judged, fitted = self.summary.validation_errors, self.summary.training_errors
         if judged is not None:
             errors = list(judged.models.values())[-1]
             return errors.p95_mm, errors.rms_mm
@@ -216,7 +216,7 @@ def compose_calibration(
     diagnostics, nominal = (*diagnostics_of(checked), *diagnostics), checked.robot
     warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
     summary = summary.with_figures(
-        calibrated=checked.figures,
+        training_errors=checked.figures,
         scale=scale_figures(checked),
         diagnostics=diagnostics,
         warnings=summary.warnings + warnings,

@@ -96,7 +96,7 @@ class ComparedModels:
             "remainder": None if differences.remainder is None else vars(differences.remainder),
             "workspace": self.workspace_displacement.to_json(first.robot),
             "rows": None if rows is None else {**rows.to_json(), "better": self.better_model},
-            "diagnostics": [one.model_dump() for one in self.diagnostics],
+            "diagnostics": [one.model_dump(by_alias=True) for one in self.diagnostics],
             "program": None
             if self.program_displacement is None
             else self.program_displacement.to_json(first.robot),

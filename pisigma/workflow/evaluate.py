@@ -102,7 +102,7 @@ class Evaluation:
         }
         if stated := self.settings.limits.stated_limits:
             values |= {"limits": stated, "accepted": self.accepted, "missed": list(self.missed_limits)}
-        values["diagnostics"] = [one.model_dump() for one in self.diagnostics]
+        values["diagnostics"] = [one.model_dump(by_alias=True) for one in self.diagnostics]
         return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
 
     def _single(self) -> dict[str, object]:

@@ -82,7 +82,7 @@ class UntrustedSession:
         return {
             "file": self.file,
             "date": self.date,
-            "diagnostics": [one.model_dump() for one in self.diagnostics],
+            "diagnostics": [one.model_dump(by_alias=True) for one in self.diagnostics],
         }
 
 

@@ -53,7 +53,7 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers and sentences as plain values, without individual rows."""
-        diagnostics = [one.model_dump() for one in self.diagnostics]
+        diagnostics = [one.model_dump(by_alias=True) for one in self.diagnostics]
         accepted = {} if self.acceptance is None else {"acceptance": self.acceptance.to_json()}
         return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds} | accepted
 

@@ -127,7 +127,7 @@ class Verification:
             else self.corrected_to_nominal_error_ratio,
             "better_share": self.better_share,
             **self.comparison.to_json(),
-            "diagnostics": [one.model_dump() for one in self.diagnostics],
+            "diagnostics": [one.model_dump(by_alias=True) for one in self.diagnostics],
             "setup_faults": [fault.to_json() for fault in self.setup_faults],
             "moved": [one.to_json() for one in self.movements.movements] if self.movements else [],
             "recalibrate": self.recalibration_command or None,

@@ -158,7 +158,7 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
         (0.01, 2.0, False, False),
         (3.0, 0.1, False, False),
     ):
-        scale = ScaleFigures(factor=1.00123, sigma=0.0002, odds=odds, rms_mm=share * rms)
+        scale = ScaleFigures(factor=1.00123, sigma=0.0002, odds=odds, rms_mm_if_sensor_error=share * rms)
         with no_type_checker():
             print_result(calibration_text(summary.with_figures(scale=scale), folder, 1.0), verbose=False)
         text = " ".join(capsys.readouterr().out.split())

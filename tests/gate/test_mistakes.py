@@ -74,7 +74,7 @@ def test_moves_of_any_size_are_not_mistakes(move):
 def test_wrong_rows_are_named():
     (mistake,) = (one for one in MISTAKES if one.name == "tracker moved by 2 mm half-way")
     (found,) = check_rows(mistake.change(filtered_rows()), original_model()).implausible_findings
-    assert found.rows == tuple(f"rows.csv, line {line}" for line in range(10, 18))
+    assert found.row_places == tuple(f"rows.csv, line {line}" for line in range(10, 18))
 
 
 @pytest.mark.parametrize("name", EVERYWHERE)

@@ -25,8 +25,10 @@ def test_a_macro_may_be_empty():
 
 
 def test_noise_is_stated_in_the_unit_of_its_sensor():
-    stated = NoiseFigures(sensor="position", values=9, used_by_parameters=1.0, factor_on_stated_sigma=1.5)
-    turning = NoiseFigures(sensor="rotation", values=9, used_by_parameters=1.0, sigma_deg=0.01)
+    stated = NoiseFigures(
+        sensor="position", value_count=9, used_by_parameters=1.0, factor_on_stated_sigma=1.5
+    )
+    turning = NoiseFigures(sensor="rotation", value_count=9, used_by_parameters=1.0, sigma_deg=0.01)
     assert "1.5 times" in render_sentences("calibration.txt.j2", "noise", stated)[0]
     assert "0.01 deg" in render_sentences("calibration.txt.j2", "noise", turning)[0]
 

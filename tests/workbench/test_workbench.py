@@ -240,7 +240,10 @@ def test_a_broken_cell_file_is_repaired_on_the_page(tmp_path):
 
 def test_warnings_point_at_their_rows_by_fields(browser_with_link, bench, cell, monkeypatch):
     one = Diagnostic(
-        kind="mixed_rows", severity="warning", sentence="rows differ", rows=("a.csv, line 3", "a.csv, line 4")
+        kind="mixed_rows",
+        severity="warning",
+        sentence="rows differ",
+        row_places=("a.csv, line 3", "a.csv, line 4"),
     )
     text = ResultText(Verdict("exact", "yes", "none"), (one.sentence,))
     monkeypatch.setitem(

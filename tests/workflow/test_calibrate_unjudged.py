@@ -14,7 +14,7 @@ def test_a_calibration_without_held_out_rows_predicts_its_error_at_other_poses(m
     arm = simulate("ur5", rows=220, noise=5e-5)
     few, others = (arm.measurements.select(torch.arange(*part)) for part in ((0, 20), (20, 220)))
     calibration = calibrate(arm.nominal, few, CalibrationSettings(model=model, folds=0))
-    predicted, fitted = calibration.summary.predicted_rms_mm, calibration.summary.calibrated
+    predicted, fitted = calibration.summary.predicted_rms_mm, calibration.summary.training_errors
     assert predicted is not None
     assert fitted is not None
     error = float(pose_errors_of(calibration.result, others).position.square().mean().sqrt()) * 1e3

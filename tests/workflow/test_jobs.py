@@ -42,7 +42,7 @@ def test_a_calibration_in_processes_gives_the_same(tasks, stated, count):
             pisigma.calibrate("kiro4", rows, CalibrationSettings(**settings, jobs=jobs)) for jobs in (None, 2)
         )
     assert here.summary.cross_validation == there.summary.cross_validation
-    assert here.summary.calibrated == there.summary.calibrated
+    assert here.summary.training_errors == there.summary.training_errors
     assert len(tasks) == count or count is None
     assert len(tasks) >= 2
 

@@ -32,7 +32,7 @@ def check_payload(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             sentence=f"{rows.place(most)}: {float(rows.payload[most]):.4g} kg is heavy for a robot with a reach of "
             f"{checked.robot.reach:.2f} m ({len(heavy)} of {rows.rows} rows are above {largest:.3g} kg); check whether "
             "the values are in grams.",
-            rows=tuple(rows.place(row) for row in heavy),
+            row_places=tuple(rows.place(row) for row in heavy),
             values={"heaviest": rows.place(most), "payload": float(rows.payload[most])},
         )
 
@@ -90,7 +90,7 @@ def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             sentence=f"{rows.place(most)}: {float(rows.temperature[most]):.4g} deg C is hot for a robot "
             f"({len(hot)} of {rows.rows} rows are above {_HOT:g} deg C); check whether the values are in degrees "
             "Fahrenheit: deg C = (deg F - 32) / 1.8.",
-            rows=tuple(rows.place(row) for row in hot),
+            row_places=tuple(rows.place(row) for row in hot),
             values={"hottest": rows.place(most), "temperature": float(rows.temperature[most])},
         )
 
@@ -107,7 +107,7 @@ def check_conditions(checked: CheckedCalibration) -> Iterator[Diagnostic]:
                 severity="warning",
                 sentence=f"expected {name} in every row, got none in {len(missing)} of {rows.rows} rows (the first is "
                 f"{rows.place(missing[0])}): its effect is not learned and remains as an error. {remedy}",
-                rows=tuple(rows.place(row) for row in missing),
+                row_places=tuple(rows.place(row) for row in missing),
                 cause=name,
                 values={"missing": len(missing)},
                 remedy=remedy,

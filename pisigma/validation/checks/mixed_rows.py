@@ -83,7 +83,7 @@ def too_many_wrong_rows_diagnostic(rows: Measurements, wrong_rows: Bool[Tensor, 
         severity="implausible",
         sentence=f"{int(wrong_rows.sum())} of {rows.rows} rows do not agree with the others: "
         f"{distinction.clause}.{_ADVICE}",
-        rows=tuple(rows.place(row) for row in wrong_rows.nonzero()[:, 0].tolist()),
+        row_places=tuple(rows.place(row) for row in wrong_rows.nonzero()[:, 0].tolist()),
         values={"distinguished_by": distinction.kind},
         remedy=_ADVICE.strip(),
     )
@@ -265,7 +265,7 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
         sentence=f"Two populations are mixed: {size} of {found.evaluated_rows} rows {difference} "
         f"({distinction.clause}); the errors of all rows together are {found.error_increase_factor:.2g} times as large "
         f"as separately. {advice}.",
-        rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
+        row_places=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
         cause=found.differing_part,
         values={
             "factor": found.error_increase_factor,

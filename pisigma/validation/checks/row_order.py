@@ -63,7 +63,7 @@ def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             severity="implausible" if certain else "warning",
             sentence=f"{what}; this makes the errors of the rows {motion.error_increase_factor:.3g} times as large. "
             f"{remedy}",
-            rows=()
+            row_places=()
             if motion.first_moved_index is None
             else (checked.rows.place(int(motion.row_indices[motion.first_moved_index])),),
             cause=motion.kind,

@@ -108,7 +108,7 @@ def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
         factor=scale.factor,
         sigma=scale.sigma,
         odds=scale.odds,
-        rms_mm=abs(scale.factor - 1) * spread * 1e3,
+        rms_mm_if_sensor_error=abs(scale.factor - 1) * spread * 1e3,
     )
 
 

@@ -53,21 +53,21 @@ class ArmBaseFigures(StoredFigures):
     tool_to_tool_mm: float
 
 
-class SharedFigures(Section):
+class SharedFigures(StoredFigures):
     """A frame or point that several arms measured under one name, or a touch of two arms.
 
     Attributes:
         kind: "joint" (of a torso), "frame", "socket", "anchor" or "touch".
         name: its name.
         arms: names of the arms.
-        distance_mm: largest distance between its positions (of a joint, between its axes) according to two arms [mm]; 0
-            if it only served to determine the bases.
+        largest_disagreement_mm: largest distance between its positions (of a joint, between its axes) according to two
+            arms [mm]; 0 if it only served to determine the bases.
     """
 
     kind: str
     name: str
     arms: tuple[str, ...]
-    distance_mm: float
+    largest_disagreement_mm: Annotated[float, Field(alias="distance_mm")]
 
 
 class TipFigures(Section):
@@ -240,7 +240,7 @@ def arms_summary(
                 kind=one.kind,
                 name=one.name,
                 arms=tuple(names[number] for number in one.arms),
-                distance_mm=distance * 1e3,
+                largest_disagreement_mm=distance * 1e3,
             )
             for one, distance in zip(bases.shared, bases.largest_distances, strict=True)
         ),

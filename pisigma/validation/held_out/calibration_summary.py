@@ -27,7 +27,7 @@ class NoiseFigures(StoredFigures):
 
     Attributes:
         sensor: kind of sensor, such as "position".
-        values: number of measured values.
+        value_count: number of measured values.
         effective_parameters: effective number of parameters estimated from them.
         sigma_mm: standard deviation of one value [mm].
         sigma_deg: standard deviation of one angle [deg].
@@ -35,14 +35,14 @@ class NoiseFigures(StoredFigures):
     """
 
     sensor: str
-    values: int | None = None
+    value_count: Annotated[int | None, Field(alias="values")] = None
     effective_parameters: Annotated[float | None, Field(alias="used_by_parameters")] = None
     sigma_mm: float | None = None
     sigma_deg: float | None = None
     factor_on_stated_sigma: float | None = None
 
 
-class ParameterFigures(Section):
+class ParameterFigures(StoredFigures):
     """One row of the parameter table; see `pisigma.calibration.geometric.result.ParameterEstimate`.
 
     Attributes:
@@ -53,7 +53,7 @@ class ParameterFigures(Section):
         change: estimated minus nominal value.
         standard_error: standard error of the estimate, see `HybridResult.parameters`; None if it was not estimated.
         remark: remark on the estimate as a sentence.
-        label: the same in a few words.
+        short_remark: the same in a few words.
     """
 
     name: str
@@ -63,7 +63,7 @@ class ParameterFigures(Section):
     change: float | None
     standard_error: float | None
     remark: str
-    label: str
+    short_remark: Annotated[str, Field(alias="label")]
 
 
 class RedundancyFigures(Section):
@@ -162,20 +162,21 @@ class JointCorrectionFigures(Section):
     trials: tuple[TrialFigures, ...]
 
 
-class ScaleFigures(Section):
+class ScaleFigures(StoredFigures):
     """Common factor on all measured lengths.
 
     Attributes:
         factor: ratio of estimated to nominal lengths of the arm [1].
         sigma: its standard deviation [1].
         odds: odds of a common factor against independent errors of the links, at most 1e6.
-        rms_mm: RMS error of true positions about their mean if the factor is an error of the sensor [mm].
+        rms_mm_if_sensor_error: RMS error of true positions about their mean if the factor is an error of the
+            sensor [mm].
     """
 
     factor: float
     sigma: float
     odds: float
-    rms_mm: float
+    rms_mm_if_sensor_error: Annotated[float, Field(alias="rms_mm")]
 
 
 class HeldOutFile(Section):
@@ -206,7 +207,7 @@ class CalibrationSummary(AbstractSummary):
         rmse_mm: RMS residual of the first sensor at every iteration, starting with the initial guess.
         hybrid: joint correction of a hybrid calibration.
         cross_validation: errors of held-out rows of the cross-validation.
-        calibrated: errors of the rows of the calibration.
+        training_errors: errors of the rows of the calibration.
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
         predicted_rms_mm: predicted RMS error at other poses if no row was held out [mm]; see
@@ -237,7 +238,7 @@ class CalibrationSummary(AbstractSummary):
     warnings: tuple[str, ...]
     rmse_mm: tuple[float, ...]
     hybrid: JointCorrectionFigures | None = None
-    calibrated: ValidationFigures | None = None
+    training_errors: Annotated[ValidationFigures | None, Field(alias="calibrated")] = None
     cross_validation: ValidationFigures | None = None
     test: ValidationFigures | None = None
     held_out: ValidationFigures | None = None
@@ -274,7 +275,7 @@ def summarise(result: Result) -> CalibrationSummary:
                 one.sensor,
                 one.sigma,
                 one.unit,
-                values=one.values,
+                value_count=one.values,
                 effective_parameters=one.effective_parameters,
             )
             for one in geometric.noise
@@ -302,7 +303,7 @@ def _parameters(result: Result) -> tuple[ParameterFigures, ...]:
         unit, factor = SHOWN_UNITS[parameter.unit]
         names = ("nominal", "estimated", "change", "standard_error")
         figures = {name: _or_none(getattr(parameter, name) * factor) for name in names}
-        texts = {"name": parameter.name, "remark": parameter.remark, "label": parameter.short_remark}
+        texts = {"name": parameter.name, "remark": parameter.remark, "short_remark": parameter.short_remark}
         rows.append(ParameterFigures(unit=unit, **texts, **figures))
     return tuple(rows)
 

@@ -179,7 +179,7 @@ def frame_calibration_summary(
                 one.sensor,
                 one.sigma,
                 one.unit,
-                values=one.values,
+                value_count=one.values,
                 effective_parameters=one.effective_parameters,
             )
             for one in result.noise

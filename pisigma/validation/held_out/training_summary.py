@@ -74,7 +74,7 @@ class TrainingRun:
     measurements: Measurements
 
 
-class JointErrorFigures(Section):
+class AbsoluteJointErrorFigures(Section):
     """Average, standard deviation and maximum of the absolute error of a joint, in degrees or millimetres.
 
     The figures are defined as in Jeong et al. 1998, Tables 1 and 2; the standard deviation is over all rows (divided
@@ -97,12 +97,12 @@ class JointErrorFigures(Section):
     maximum_mm: float | None = None
 
     @staticmethod
-    def from_errors(errors: Float64[Tensor, " rows"], revolute: bool) -> "JointErrorFigures":
+    def from_errors(errors: Float64[Tensor, " rows"], revolute: bool) -> "AbsoluteJointErrorFigures":
         """Compute the figures of the errors of a joint [rad or m]."""
         unit, factor = ("deg", math.degrees(1.0)) if revolute else ("mm", 1e3)
         sizes = errors.abs()
         figures = {"average": sizes.mean(), "deviation": sizes.std(correction=0), "maximum": sizes.max()}
-        return JointErrorFigures(
+        return AbsoluteJointErrorFigures(
             **{f"{name}_{unit}": float(value) * factor for name, value in figures.items()}
         )
 
@@ -125,8 +125,8 @@ class BeforeAfter(Section):
         after: errors after the correction.
     """
 
-    before: JointErrorFigures
-    after: JointErrorFigures
+    before: AbsoluteJointErrorFigures
+    after: AbsoluteJointErrorFigures
 
 
 class JointFigures(Section):
@@ -283,7 +283,7 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
     for rows, errors in (("training", run.training), ("held_out", run.held_out)):
         if errors is not None:
             before, after = (
-                JointErrorFigures.from_errors(values[:, index], robot.revolute[index])
+                AbsoluteJointErrorFigures.from_errors(values[:, index], robot.revolute[index])
                 for values in (errors.before, errors.after)
             )
             figures[rows] = BeforeAfter(before=before, after=after)

@@ -235,6 +235,6 @@ def _zeros(model: CalibratedModel) -> tuple[JointZero, ...]:
     ):
         one = figures.get(name)
         if joint.type == "revolute" and one is not None and one.change is not None:
-            known = None if "prior" in one.label else one.standard_error
+            known = None if "prior" in one.short_remark else one.standard_error
             zeros.append(JointZero(joint.name, direction * one.change, known))
     return tuple(zeros)

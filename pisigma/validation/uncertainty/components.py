@@ -96,7 +96,7 @@ def scatter_component(model: CalibratedModel) -> Component | str:
     if math.isnan(sigma):
         return f"{SCATTER}: the calibration did not estimate the standard deviation of a coordinate."
     noise = _noise(model)
-    values = "" if noise is None else f" of {noise.values} coordinates"
+    values = "" if noise is None else f" of {noise.value_count} coordinates"
     source = f"residuals{values} of the calibration; repeatability and noise of the instrument included"
     return Component(SCATTER, "A", sigma, _freedom(model), source)
 
@@ -166,12 +166,12 @@ def _noise(model: CalibratedModel) -> NoiseFigures | None:
         return None
     learned = None if summary.hybrid is None else summary.hybrid.learned
     every = summary.noise if learned is None else learned.noise
-    return next((one for one in every if one.sensor == _POSITION and one.values is not None), None)
+    return next((one for one in every if one.sensor == _POSITION and one.value_count is not None), None)
 
 
 def _freedom(model: CalibratedModel) -> float | None:
     """Return the degrees of freedom of the residuals, `n - p`; None if the model does not store them."""
     noise = _noise(model)
-    if noise is None or noise.values is None or noise.effective_parameters is None:
+    if noise is None or noise.value_count is None or noise.effective_parameters is None:
         return None
-    return max(noise.values - noise.effective_parameters, 1.0)
+    return max(noise.value_count - noise.effective_parameters, 1.0)

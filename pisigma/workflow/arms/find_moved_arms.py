@@ -6,17 +6,18 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from pydantic import Field
 from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior
 from pisigma.files.errors import ModelError, Place, choice_remedy
 from pisigma.files.model_files import model_hash
-from pisigma.files.yaml_file import Section, read_yaml
+from pisigma.files.yaml_file import StoredFigures, read_yaml
 from pisigma.lifetime.comparison.moved_bases import MovedBases, MovedBody, RemeasuredArm, find_moved_bases
 from pisigma.lifetime.recalibration.movement import sigma_along
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -31,28 +32,28 @@ from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE
 Three = tuple[float, float, float]
 
 
-class MovedFigures(Section):
+class MovedFigures(StoredFigures):
     """An arm, a frame, or the zero of the first joint of a torso that may have moved.
 
     Attributes:
         kind: "arm" (its base, or the one base of the arms of a torso), "frame" or "joint" (its zero).
         name: name of the arm (the first one of a torso), frame or joint.
-        is_named: whether its motion explains the rows best; if this is true of several, the rows cannot distinguish
-            them.
+        is_best_explanation: whether its motion explains the rows best; if this is true of several, the rows cannot
+            distinguish them.
         shift_mm: shift of its origin along x, y, z of the first arm's base [mm], if only it moved.
         rotation_deg: rotation about these axes [deg], as a rotation vector.
         standard_errors: standard errors of shift and rotation [mm and deg].
-        distance_error_mm: standard error of the length of the shift [mm].
+        shift_standard_error_mm: standard error of the length of the shift [mm].
         log_likelihood: log likelihood if only it moved, relative to no motion [nats].
     """
 
     kind: str
     name: str
-    is_named: bool
+    is_best_explanation: Annotated[bool, Field(alias="is_named")]
     shift_mm: Three
     rotation_deg: Three
     standard_errors: Six
-    distance_error_mm: float
+    shift_standard_error_mm: Annotated[float, Field(alias="distance_error_mm")]
     log_likelihood: float
 
     @property
@@ -67,7 +68,7 @@ class MovedFigures(Section):
         turned = math.hypot(*self.rotation_deg)
         return (
             f"the {what} '{self.name}' moved by {math.hypot(*self.shift_mm):.3g} mm (standard error "
-            f"{self.distance_error_mm:.2g} mm) and {turned:.2g} deg"
+            f"{self.shift_standard_error_mm:.2g} mm) and {turned:.2g} deg"
         )
 
 
@@ -88,7 +89,7 @@ class ArmsMovement:
     @property
     def sentence(self) -> str:
         """Sentence that states what moved."""
-        named = [one.sentence for one in self.bodies if one.is_named]
+        named = [one.sentence for one in self.bodies if one.is_best_explanation]
         if not named:
             return "Nothing moved."
         doubt = (
@@ -106,7 +107,7 @@ class ArmsMovement:
             "summary": self.sentence,
             "probability": self.moved_bases.p_value,
             "is_one_body": self.moved_bases.is_one_body,
-            "bodies": [one.model_dump(mode="json") for one in self.bodies],
+            "bodies": [one.model_dump(mode="json", by_alias=True) for one in self.bodies],
         }
 
 
@@ -188,15 +189,15 @@ def _arm(
     )
 
 
-def _figures(one: MovedBody, is_named: bool) -> MovedFigures:
+def _figures(one: MovedBody, is_best: bool) -> MovedFigures:
     sizes = one.covariance.diagonal().sqrt() * torch.tensor([1e3] * 3 + [math.degrees(1)] * 3).double()
     return MovedFigures(
         kind=one.kind,
         name=one.name,
-        is_named=is_named,
+        is_best_explanation=is_best,
         shift_mm=tuple((one.shift * 1e3).tolist()),
         rotation_deg=tuple(one.rotation.rad2deg().tolist()),
         standard_errors=tuple(sizes.tolist()),
-        distance_error_mm=sigma_along(one.shift, one.covariance[:3, :3]) * 1e3,
+        shift_standard_error_mm=sigma_along(one.shift, one.covariance[:3, :3]) * 1e3,
         log_likelihood=one.log_likelihood,
     )

@@ -38,7 +38,7 @@ def test_values_of_another_unit_are_warned_of(name: str, check: Check, largest: 
         assert rows.place(29) in diagnostic.values.values()
         assert diagnostic.values[name] == largest
         limit = 60 if name == "temperature" else 200 * simulated.nominal.reach**3
-        assert diagnostic.rows == tuple(rows.place(row) for row in range(30) if values[row] > limit)
+        assert diagnostic.row_places == tuple(rows.place(row) for row in range(30) if values[row] > limit)
 
 
 @pytest.mark.parametrize("name", ["payload", "temperature"])
@@ -52,7 +52,7 @@ def test_a_condition_that_only_some_rows_state_is_warned_of(name: str, missing: 
     assert len(found) == findings
     for diagnostic in found:
         assert diagnostic.cause.startswith(name)
-        assert diagnostic.rows == tuple(rows.place(row) for row in range(18, 30))
+        assert diagnostic.row_places == tuple(rows.place(row) for row in range(18, 30))
 
 
 @pytest.mark.parametrize("expansion", [0.0, 12e-6])

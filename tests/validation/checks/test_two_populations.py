@@ -59,7 +59,7 @@ def test_two_arms_in_one_file_are_distinguished(name, alternating):
     of_other = np.arange(100) % 2 == 1 if alternating else np.random.default_rng(1).random(100) < 0.4
     (found,) = populations(arm.robot, either(arm.measured(), other.measured(), of_other))
     assert (found.kind, found.severity) == ("two_populations", "implausible")
-    named = np.array([f"rows.csv, line {line}" in found.rows for line in range(2, 102)])
+    named = np.array([f"rows.csv, line {line}" in found.row_places for line in range(2, 102)])
     assert max(np.mean(named == of_other), np.mean(named != of_other)) > 0.95
     assert found.cause == "arm"
     assert (found.values["distinguished_by"] == "period") == alternating
@@ -73,7 +73,7 @@ def test_rows_of_another_target_are_found(name, size):
     (found,) = populations(arm.robot, either(arm.measured(), arm.measured(tool=shift), moved))
     assert found.severity == ("implausible" if size > 2e-3 else "warning")
     assert found.cause == "tool"
-    assert np.mean([f"rows.csv, line {line}" in found.rows for line in range(2, 102)] == moved) > 0.95
+    assert np.mean([f"rows.csv, line {line}" in found.row_places for line in range(2, 102)] == moved) > 0.95
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_few_rows_in_another_frame_are_found():
     shifted = replace(rows, position=rows.position + 1.5e-3 / 3**0.5 * moved[:, None].double())
     (found,) = populations(arm.robot, shifted)
     assert found.cause == "frame"
-    assert len(found.rows) == int(moved.sum())
+    assert len(found.row_places) == int(moved.sum())
 
 
 def test_poses_in_two_named_frames_are_one_population():

@@ -63,7 +63,14 @@ def test_errors_of_zeros_count_in_the_direction_of_the_joint(monkeypatch):
     )
     monkeypatch.setattr(prior_ratio, "setup_diagnostics", lambda *_: ())
     figures = ParameterFigures(
-        name="theta_3", unit="deg", nominal=0, estimated=2, change=2, standard_error=0.01, remark="", label=""
+        name="theta_3",
+        unit="deg",
+        nominal=0,
+        estimated=2,
+        change=2,
+        standard_error=0.01,
+        remark="",
+        short_remark="",
     )
     summary = bare_summary(parameters=(figures,))
     monkeypatch.setattr(CalibrationSummary, "read", lambda _: summary)

@@ -21,12 +21,14 @@ from pisigma.validation.held_out.pose_statistics import (
     compare_with_nominal,
     error_statistics,
 )
-from pisigma.validation.held_out.training_summary import JointErrorFigures
+from pisigma.validation.held_out.training_summary import AbsoluteJointErrorFigures
 
 
 @pytest.mark.parametrize(("revolute", "unit", "factor"), [(True, "deg", math.degrees(1)), (False, "mm", 1e3)])
 def test_joint_errors_are_of_the_absolute_error_in_file_units(revolute, unit, factor):
-    figures = JointErrorFigures.from_errors(torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64), revolute)
+    figures = AbsoluteJointErrorFigures.from_errors(
+        torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64), revolute
+    )
     assert figures.unit == unit
     average, deviation, maximum = figures.values
     assert_close(average, 0.2 * factor, rtol=1e-14)

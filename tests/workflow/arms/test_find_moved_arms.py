@@ -37,26 +37,26 @@ def now(body: str) -> dict[str, Measurements]:
 
 def test_nothing_is_named_if_nothing_moved(folder):
     found = find_moved_arms(folder, now(""))
-    assert not any(one.is_named for one in found.bodies)
+    assert not any(one.is_best_explanation for one in found.bodies)
     assert found.to_json()["probability"] > 1e-3
 
 
 def test_bumped_base_is_named_with_shift_and_standard_errors(folder):
     found = find_moved_arms(folder, now("right"))
-    (one,) = (one for one in found.bodies if one.is_named)
+    (one,) = (one for one in found.bodies if one.is_best_explanation)
     assert (one.kind, one.name, found.moved_bases.is_one_body) == ("arm", "right", True)
     assert_close(one.shift_mm, [0.3, 0.0, -0.4], atol=0.1)
     assert max(one.standard_errors[:3]) < 0.05
     (body,) = found.moved_bases.likely_bodies
     drawn = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     lengths = (body.shift + drawn @ torch.linalg.cholesky(body.covariance[:3, :3]).mT).norm(dim=1)
-    assert_close(one.distance_error_mm, float(lengths.std()) * 1e3, rtol=0.05)
-    assert f"{one.distance_error_mm:.2g} mm" in one.sentence
+    assert_close(one.shift_standard_error_mm, float(lengths.std()) * 1e3, rtol=0.05)
+    assert f"{one.shift_standard_error_mm:.2g} mm" in one.sentence
 
 
 def test_one_arm_cannot_say_whether_it_or_the_frame_moved(folder):
     found = find_moved_arms(folder, {"right": now("right")["right"]})
-    assert {one.name for one in found.bodies if one.is_named} == {"right", "hall"}
+    assert {one.name for one in found.bodies if one.is_best_explanation} == {"right", "hall"}
 
 
 def test_unknown_arm_is_refused(folder):

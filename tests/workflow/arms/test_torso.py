@@ -83,12 +83,12 @@ def test_frames_state_one_base_and_the_shared_joints(folder):
 
 
 def test_nothing_is_named_if_nothing_moved(folder, nominal):
-    assert not any(one.is_named for one in find_moved_arms(folder, now(nominal, STILL)).bodies)
+    assert not any(one.is_best_explanation for one in find_moved_arms(folder, now(nominal, STILL)).bodies)
 
 
 def test_new_zero_of_the_waist_is_named_once(folder, nominal):
     found = find_moved_arms(folder, now(nominal, STILL, 1e-3))
-    (one,) = (one for one in found.bodies if one.is_named)
+    (one,) = (one for one in found.bodies if one.is_best_explanation)
     assert (one.kind, one.name, found.moved_bases.is_one_body) == ("joint", "waist", True)
     assert_close(np.deg2rad(np.linalg.norm(one.rotation_deg)), 1e-3, atol=1e-4)
 
@@ -98,7 +98,7 @@ def test_base_of_the_torso_or_the_frame_is_named(folder, nominal):
         rotation_from_vector(torch.tensor([5e-4, 0, 0]).double()), torch.tensor([0, 5e-4, 0]).double()
     )
     found = find_moved_arms(folder, now(nominal, bump))
-    assert {(one.kind, one.name) for one in found.bodies if one.is_named} == {
+    assert {(one.kind, one.name) for one in found.bodies if one.is_best_explanation} == {
         ("arm", "left"),
         ("frame", "hall"),
     }
