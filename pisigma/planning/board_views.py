@@ -99,7 +99,7 @@ class ViewConditions:
         """Compute the angle of the board's normal to the line of sight to its centre [rad]; > π / 2 from behind."""
         return self._obliqueness(self._boards(arm, q)[0])
 
-    def placement_margin(
+    def board_shift_margin(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
         """Compute how far the board may be from its stated position before it leaves the image [m]."""

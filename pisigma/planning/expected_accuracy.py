@@ -237,7 +237,7 @@ class CameraProspects:
             else rms_of(after.tool_derivatives(task)),
             rms(posterior_with(_EXACT_CORNERS, sight.repeatability)),
             rms(posterior_with(sight.corner_noise, _EXACT_ROBOT)),
-            float(views.placement_margin(arm, q).min()),
+            float(views.board_shift_margin(arm, q).min()),
             _unidentifiable(arm, sight.is_fixed),
         )
 

@@ -136,7 +136,7 @@ class RobotPosterior:
             result.uncertainty, None if result.learned is None else result.learned.correction, instrument
         )
 
-    def updated_with(self, rows: Measurements) -> "RobotPosterior":
+    def calibrated_with(self, rows: Measurements) -> "RobotPosterior":
         """Return the posterior given measured rows, from a hybrid calibration with these rows.
 
         If there are too few rows for a calibration, only the covariance is updated, from the joint values.

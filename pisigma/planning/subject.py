@@ -121,7 +121,7 @@ class RobotOrModel:
         if settings.measured is None:
             return posterior
         rows = read_planned_rows(settings, settings.measured, arm.robot).split_sets()[0]
-        return posterior.updated_with(rows) if self.model is None else posterior.after_measuring(rows.q)
+        return posterior.calibrated_with(rows) if self.model is None else posterior.after_measuring(rows.q)
 
     def _seen_by_camera(
         self, arm: ArmInSurroundings, settings: PlanSettings, views: ViewConditions

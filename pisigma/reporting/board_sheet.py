@@ -11,7 +11,7 @@ from matplotlib.path import Path as Outline
 
 from pisigma.files.errors import OutputError
 from pisigma.measurement.camera.board import RULER, Board
-from pisigma.measurement.camera.pattern import Pattern, board_pattern
+from pisigma.measurement.camera.pattern import Pattern, printed_pattern
 
 _PAPERS = {
     "A4 or Letter": (210.0, 279.4),
@@ -57,7 +57,7 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
         marker=board.marker / board.print_scale,
         print_scale=1.0,
     )
-    pattern = board_pattern(wanted)
+    pattern = printed_pattern(wanted)
     across, down = 1e3 * (pattern.sheet_rectangle[2:] - pattern.sheet_rectangle[:2])
     paper, (width, height) = _paper(board, float(across), float(down))
     figure = Figure(figsize=(width * MM, height * MM))

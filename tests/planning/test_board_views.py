@@ -52,7 +52,7 @@ def test_views_cover_all_angles_distances_and_branches(settings: PlanSettings, d
     solver = closed_form_solver(arm.robot)
     assert solver is not None
     assert len(nearest_branch(solver, drawn.q).unique()) >= 6
-    assert 0 < float(views.placement_margin(arm, drawn.q).min()) < 0.05
+    assert 0 < float(views.board_shift_margin(arm, drawn.q).min()) < 0.05
 
 
 def test_the_workspace_is_not_that_of_the_views(drawn: Candidates):

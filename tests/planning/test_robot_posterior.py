@@ -78,7 +78,7 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
     assert_close(
-        posterior.updated_with(rows).sigma(task), posterior.after_measuring(q).sigma(task), rtol=1e-9
+        posterior.calibrated_with(rows).sigma(task), posterior.after_measuring(q).sigma(task), rtol=1e-9
     )
 
 

@@ -6,7 +6,7 @@ import torch
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.pattern import board_pattern
+from pisigma.measurement.camera.pattern import printed_pattern
 from pisigma.robot.se3 import rotation_from_zyx
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
@@ -31,7 +31,7 @@ def draw_board(
     noise: float = 1.0,
 ) -> np.ndarray:
     """Return a grey image of a white sheet with a board on a grey background."""
-    pattern = board_pattern(board)
+    pattern = printed_pattern(board)
     image = np.full((FINER * camera.height, FINER * camera.width), 120, dtype=np.uint8)
     for rectangle, gray in (
         (pattern.sheet_rectangle, 210),

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.frames.whitened_values import FrameDirections, WhitenedValues
+from pisigma.calibration.frames.whitened_values import FrameUncertaintyDirections, WhitenedValues
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.observability import direction_in_words
 from pisigma.calibration.geometric.identifiability.sufficiency import floating_frames
@@ -151,7 +151,7 @@ class FrameFit:
     def _directions(self) -> tuple[Float64[Tensor, "frames frames"], Float64[Tensor, " frames"]]:
         """Return unit vectors in the user's coordinates, with standard deviations in mm and mrad, weakest first."""
         found, held = (
-            FrameDirections.at_solution(self.solved, self.frame_indices),
+            FrameUncertaintyDirections.at_solution(self.solved, self.frame_indices),
             self.solved.problem.held_directions,
         )
         if held is not None:  # with the deviation that was judged
@@ -301,7 +301,7 @@ def hold_undetermined(
     Returns:
         The fit; `problem.held_directions` contains the held directions, if any.
     """
-    found, space = FrameDirections.at_solution(solved, coordinate_indices), solved.problem.space
+    found, space = FrameUncertaintyDirections.at_solution(solved, coordinate_indices), solved.problem.space
     unknown = int(torch.isinf(found.sigma).sum())
     before, rows = initial_parameters(space, previous_bases, previous_tools), solved.problem.rows
     distance = found.distances(solved, before).abs()
@@ -332,7 +332,7 @@ def _with_held(
 ) -> SolvedCalibration:
     """Shift the least determined directions to their previous values, and refit the others, until nothing changes."""
     for _ in range(_MAX_SHIFTS):
-        found = FrameDirections.at_solution(solved, frames)
+        found = FrameUncertaintyDirections.at_solution(solved, frames)
         held = HeldDirections(found.directions[:, : len(deviation)], deviation)
         missing = found.distances(solved, before)[: len(deviation)]
         if solved.problem.held_directions is not None and float(missing.abs().max()) < _SMALL:

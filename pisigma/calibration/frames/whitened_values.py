@@ -94,7 +94,7 @@ class WhitenedValues:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameDirections:
+class FrameUncertaintyDirections:
     """Independent directions in the coordinates of frames, least determined first.
 
     Attributes:
@@ -106,7 +106,9 @@ class FrameDirections:
     sigma: Float64[Tensor, " frames"]
 
     @staticmethod
-    def at_solution(solved: SolvedCalibration, coordinate_indices: Sequence[int]) -> "FrameDirections":
+    def at_solution(
+        solved: SolvedCalibration, coordinate_indices: Sequence[int]
+    ) -> "FrameUncertaintyDirections":
         """Return the directions at a solution, with the noise estimated from its residuals.
 
         Args:
@@ -122,7 +124,9 @@ class FrameDirections:
         directions = X.new_zeros(len(active), len(information))
         directions[ours] = vectors
         is_known = information > _ROUNDING * information.max()
-        return FrameDirections(directions, torch.where(is_known, information.clamp(min=0) ** -0.5, torch.inf))
+        return FrameUncertaintyDirections(
+            directions, torch.where(is_known, information.clamp(min=0) ** -0.5, torch.inf)
+        )
 
     def in_user_coordinates(
         self, solved: SolvedCalibration

@@ -77,7 +77,7 @@ class BinaryFrames(AbstractProtocol):
         try:
             model = self._models.find_model(index)
         except RequestError:
-            why = Refusal.MODEL_REFUSED if self._models.is_refused else Refusal.NO_SUCH_MODEL
+            why = Refusal.MODEL_REFUSED if self._models.is_use_forbidden else Refusal.NO_SUCH_MODEL
             return self._refuse(name, why, begun)
         if model.has_compiled_solver:
             return self._solve(model, message, name, begun)

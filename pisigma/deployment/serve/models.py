@@ -263,7 +263,7 @@ class ServedModels:
         return tuple(f"{model.name}: {one}" for model in self._models for one in model.ik.warnings)
 
     @property
-    def is_refused(self) -> bool:
+    def is_use_forbidden(self) -> bool:
         """Whether exports that are active on the controller of the cell forbid the use of any model."""
         return self._in_use is not None and bool(self._in_use.findings.refusal)
 
@@ -274,7 +274,7 @@ class ServedModels:
             RequestError: there is no such model, None is given and there are several, or the model must not be used
                 with the export that is active on the controller.
         """
-        if self.is_refused and self._in_use is not None:
+        if self.is_use_forbidden and self._in_use is not None:
             raise RequestError(self._in_use.findings.refusal)
         models = self._models
         if name is None and len(models) == 1:

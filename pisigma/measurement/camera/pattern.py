@@ -21,7 +21,7 @@ class Pattern:
     sheet_rectangle: Float64[np.ndarray, " 4"]
 
 
-def board_pattern(board: Board) -> Pattern:
+def printed_pattern(board: Board) -> Pattern:
     """Return the pattern of a board, with a white margin of half a square.
 
     Checkerboards have one more square than corners in each direction, the first one black. ChArUco boards have the

@@ -280,7 +280,7 @@ class IntrinsicsSensor(AbstractSensor):
 
 
 @dataclass(frozen=True, eq=False)
-class BoardScaleSensor(AbstractSensor):
+class BoardScalePrior(AbstractSensor):
     """The prior of the scale of a board, as the value of one row.
 
     With the unknown s, every length of the board is `1 + s` times its stated length.
@@ -303,7 +303,7 @@ class BoardScaleSensor(AbstractSensor):
     sigma: Float64[Tensor, " rows"]
 
     @classmethod
-    def build(cls, rows: SensorRows) -> "BoardScaleSensor | None":
+    def build(cls, rows: SensorRows) -> "BoardScalePrior | None":
         """Build the sensor with every board of free scale assigned to its first row; None if there is no such board."""
         data, names = rows.measurements, boards(rows.measurements)
         deviations = scale_sigmas(data)

@@ -15,7 +15,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.sensors.corner import CornerSensor, as_poses
 from pisigma.measurement.sensors.distance import AnchorSensor, PairSensor
-from pisigma.measurement.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
+from pisigma.measurement.sensors.intrinsics import BoardScalePrior, IntrinsicsSensor
 from pisigma.measurement.sensors.pose import PositionSensor, RotationSensor, TouchSensor
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
@@ -79,7 +79,7 @@ for _sensor in (
     PairSensor,
     CornerSensor,
     IntrinsicsSensor,
-    BoardScaleSensor,
+    BoardScalePrior,
 ):
     register_sensor(_sensor)
 

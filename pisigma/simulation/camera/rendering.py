@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.pattern import Pattern, board_pattern
+from pisigma.measurement.camera.pattern import Pattern, printed_pattern
 from pisigma.robot.se3 import rotation_from_vector, transform
 
 _NODE_STEP = 16
@@ -58,7 +58,7 @@ class TrueBoard:
     @property
     def pattern(self) -> Pattern:
         """Printed pattern of the board at its true size."""
-        stated = board_pattern(self.described_board)
+        stated = printed_pattern(self.described_board)
         return Pattern(self.scale * stated.black_rectangles, self.scale * stated.sheet_rectangle)
 
     def height(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:

@@ -4,12 +4,12 @@ import numpy as np
 from testing.closeness import assert_close
 
 from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.pattern import board_pattern
+from pisigma.measurement.camera.pattern import printed_pattern
 
 
 def test_black_squares_meet_at_every_corner_and_stay_on_the_sheet():
     board = Board("board", 4, 5, 0.03)
-    pattern = board_pattern(board)
+    pattern = printed_pattern(board)
     left, top, right, bottom = pattern.black_rectangles.T
     assert_close((right - left) * (bottom - top), np.full(len(left), 0.03**2), atol=1e-12)
     assert len(left) == 15

@@ -106,7 +106,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     followed._in_use.load_if_changed()
     (sentence,) = served.reload()
     assert "offsets.csv" in sentence
-    assert served.is_refused
+    assert served.is_use_forbidden
     line = JsonLines(served, Metrics()).answer_message(b'{"ask": "models", "model": 0}')
     assert "error" not in json.loads(line)
     assert (

@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup
 from pisigma.files.errors import IdentificationError, Place
-from pisigma.measurement.sensors.intrinsics import SCALE_COLUMN, BoardScaleSensor, IntrinsicsSensor, texts_of
+from pisigma.measurement.sensors.intrinsics import SCALE_COLUMN, BoardScalePrior, IntrinsicsSensor, texts_of
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
@@ -281,7 +281,7 @@ def _scale_of_boards(setup: CalibrationSetup) -> str:
 
 def _lengths(setup: CalibrationSetup) -> set[str]:
     """Return the sensors that measure lengths."""
-    stated = (IntrinsicsSensor.name, BoardScaleSensor.name)
+    stated = (IntrinsicsSensor.name, BoardScalePrior.name)
     return {
         sensor.name for sensor in setup.problem.sensors if sensor.unit == "m" and sensor.name not in stated
     }

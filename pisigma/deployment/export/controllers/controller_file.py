@@ -77,7 +77,7 @@ class ControllerFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class Convention:
+class ControllerRobot:
     """A controller's description of a robot.
 
     Attributes:
@@ -112,8 +112,8 @@ class ControllerFile:
         contents: contents of a file, with an article.
         suffixes: suffixes of its files.
         source: sentence on the source of the format and its tests; see `untested_sentence`.
-        convention: function that returns the controller's description of a robot, or raises a `PisigmaError` if there
-            is none.
+        controller_robot: function that returns the controller's description of a robot, or raises a `PisigmaError` if
+            there is none.
         requirements: sentences on what the file requires of the controller.
         text: function that returns the text of a file.
         read: function of text, file name and nominal robot that returns the robot of a file; None if the file includes
@@ -134,7 +134,7 @@ class ControllerFile:
     text: Callable[[FileContent], str]
     read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
-    convention: Callable[[Robot], Convention] = Convention
+    controller_robot: Callable[[Robot], ControllerRobot] = ControllerRobot
     parameters: Callable[[Robot], Sequence[int]] = all_parameter_indices
     options: frozenset[str] = field(default_factory=frozenset)
     refuse: Callable[[ExportRequest], None] = lambda request: None
@@ -171,11 +171,11 @@ class ControllerFile:
             held = self.read(self.text(draft), str(request.out), nominal)
         lost, of_nominal = fit.deviation_of(held), fit.deviation_of(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
-        convention = self.convention(model.nominal or nominal)
+        described = self.controller_robot(model.nominal or nominal)
         sentences = [
             title,
             self.source,
-            *convention.remarks,
+            *described.remarks,
             departure_sentence("This file deviates", lost, of_nominal),
         ]
         if corrects_joints(model):
@@ -186,8 +186,8 @@ class ControllerFile:
         sentences += [*self.requirements, *condition_remarks(model), *frame_remarks(model)]
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(of_nominal)}
         facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
-        if convention.frames:
-            facts["frames"] = convention.frames.to_json()
+        if described.frames:
+            facts["frames"] = described.frames.to_json()
         text = self.text(replace(draft, comments=tuple(sentences)))
         return Exported(text, model_facts(model) | facts, tuple(sentences))
 
@@ -297,11 +297,11 @@ def read_controller_file(path: Path, nominal: Robot, max_change_mm: float = MAX_
     file = next(suited, None)
     read = read_offsets if file is None or file.read is None else file.read
     robot = read(text, str(path), nominal)
-    convention = file.convention(nominal) if file else Convention(nominal)
+    described = file.controller_robot(nominal) if file else ControllerRobot(nominal)
     # The base and tool of the file define the frames of its poses and are not treated as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
     change = departure_from_nominal(
-        robot, with_frames_from_comments(convention.nominal, text) if file else there
+        robot, with_frames_from_comments(described.nominal, text) if file else there
     )
     if not max(change.mean_mm, _LEVER * change.mean_mrad) <= max_change_mm:
         raise RobotError(
@@ -314,11 +314,11 @@ def read_controller_file(path: Path, nominal: Robot, max_change_mm: float = MAX_
             remedy="check that --like is the robot of this file and that its units are radians and metres, or state "
             "--max-change-mm",
         )
-    frames = convention.frames
+    frames = described.frames
     source = f"Read from {path.name} with the nominal robot '{nominal.name}'."
     source = f"{source} {frames.sentence}" if frames else source
     remarks = (
-        (file.source, *convention.remarks)
+        (file.source, *described.remarks)
         if file
         else ("Tables of offsets and counts are a format of pisigma.",)
     )

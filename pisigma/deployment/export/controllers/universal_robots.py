@@ -15,7 +15,7 @@ from pisigma.deployment.export.controllers.ur_models import (
     JOINTS,
     check_robot,
     controller_geometry,
-    convention,
+    controller_robot,
     without_beta,
 )
 from pisigma.deployment.export.dh_table import header_comment
@@ -102,7 +102,7 @@ FILE = ControllerFile(
     text=write_calibration,
     read=read_calibration,
     check=check_robot,
-    convention=convention,
+    controller_robot=controller_robot,
     options=frozenset(("like",)),
 )
 FORMAT = FILE.export_format()

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from pisigma.deployment.export.approximation import ApproximationProblem, solve_approximation
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFrames,
-    Convention,
+    ControllerRobot,
     check_plain_joints,
 )
 from pisigma.files.errors import RobotError
@@ -204,13 +204,13 @@ def without_beta(origins: list[Frame], robot: Robot) -> Robot:
     return plain.with_geometry(dh=dh)
 
 
-def convention(described_robot: Robot) -> Convention:
+def controller_robot(described_robot: Robot) -> ControllerRobot:
     """Return the controller's description of an arm, and the values with which its files were tested."""
     own = controller_geometry(described_robot)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
         values.append(f"the maker's default kinematics and hash of the {own.model} ({_DEFAULTS})")
-    return Convention(own.robot, own.frames(), " and ".join(values) or None)
+    return ControllerRobot(own.robot, own.frames(), " and ".join(values) or None)
 
 
 def check_robot(robot: Robot) -> None:

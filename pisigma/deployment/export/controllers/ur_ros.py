@@ -14,7 +14,7 @@ from pisigma.deployment.export.controllers.ur_models import (
     JOINTS,
     check_robot,
     controller_geometry,
-    convention,
+    controller_robot,
     without_beta,
 )
 from pisigma.deployment.export.dh_table import header_comment
@@ -165,7 +165,7 @@ FILE = ControllerFile(
     text=write_kinematics,
     read=read_kinematics,
     check=check_robot,
-    convention=convention,
+    controller_robot=controller_robot,
     contains="description",
     marker="kinematics:",
 )
