@@ -59,8 +59,8 @@ def several_names(model: CalibratedModel) -> Iterator[tuple[str, tuple[str, ...]
 def warnings_without_rows(model: CalibratedModel) -> tuple[str, ...]:
     """Return warnings about poses for which no row states a condition, a frame or a target."""
     several = (
-        f"{model.name} was calibrated for {len(names)} {kind}s ({', '.join(names)}); poses are those "
-        f"{'in' if kind == 'frame' else 'of'} {kind} '{names[0]}', unless --{kind} or `for_target` states another."
+        f"Poses are those {'in' if kind == 'frame' else 'of'} {kind} '{names[0]}', the first of {len(names)} "
+        f"({', '.join(names)}), unless --{kind} or `for_target` states another."
         for kind, names in several_names(model)
     )
     return (*condition_warnings(model), *several)

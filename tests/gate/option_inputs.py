@@ -202,11 +202,13 @@ def _models(folder: Path) -> None:
     learned = ConditionFeatures(
         robot, ("payload_kg", "temperature_c"), (2.0, 22.0), (1.5, 3.0), ((0.0, 5.0), (15.0, 30.0))
     )
+    arm10 = hand_made_model("ur10")
+    names = {"bases": {"cell": arm10.robot.base}, "tools": {"torch": arm10.robot.tool}}
     for name, model in (
         ("loaded", hybrid_model("ur10", [FourierSeries(robot, 2), learned])),
         ("scara", hand_made_model("kiro3")),
         ("so101", so101_model()),
-        ("arm10", hand_made_model("ur10")),
+        ("arm10", replace(arm10, **names)),
     ):
         (folder / name).mkdir()
         save_model(model, folder / name)
