@@ -17,7 +17,6 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.alternatives import Cause
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.files.errors import ModelError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import (
     CalibratedModel,
@@ -26,6 +25,7 @@ from pisigma.model.calibrated_model import (
     corrected_joints,
     model_names_of_rows,
 )
+from pisigma.model.frame_choice import check_frames_can_change
 from pisigma.model.geometric_model import branches_of, model_of_calibration
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
@@ -81,13 +81,7 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, frame_choice: Fr
         IdentificationError: see `fit_frames`.
         PoseError: the joint values do not fit the robot.
     """
-    if model.network is not None:
-        raise ModelError(
-            f"the network of model '{model.name}' is valid only for the base and tool with which it was trained, so "
-            "neither can be fitted",
-            value=model.kind,
-            remedy="use a geometric or hybrid model",
-        )
+    check_frames_can_change(model)
     arm = model.hybrid
     bases, tools = (model.bases, model.tools) if arm is None else (model.hybrid_bases, model.hybrid_tools)
     if frame_choice == "tool":

@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.frame_choice import several_names
+from pisigma.model.frame_choice import several_names, warnings_without_rows, with_frame_and_target
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 
 Q = np.array([0.3, 0.2, -0.1, 0.2, 0.5, 0.3])
@@ -63,6 +63,16 @@ def test_the_task_is_kept(model: CalibratedModel) -> None:
     of_target = ik.for_target("B")
     assert of_target.task_axes == ik.task_axes
     assert of_target(of_target.forward(Q), near=Q).ignored_axes == ("yaw",)
+
+
+def test_a_network_is_valid_only_for_its_own_target(model: CalibratedModel, repository: Path) -> None:
+    network = load_model(repository / "models" / "kiro3").network
+    trained = replace(model, hybrid=None, calibrated=None, network=network)
+    assert with_frame_and_target(trained, target="A").tools.keys() == {"A"}
+    with pytest.raises(ModelError) as caught:
+        with_frame_and_target(trained, target="B")
+    assert caught.value.value == trained.kind
+    assert len(warnings_without_rows(trained)) == 1
 
 
 @pytest.mark.parametrize("names", [{"target": "D"}, {"frame": "cell"}])

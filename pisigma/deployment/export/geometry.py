@@ -94,8 +94,7 @@ def _hybrid_remarks(model: CalibratedModel) -> tuple[str, ...]:
         f"Hybrid geometry of model {model.name} (robot {model.robot.name}), by pisigma {__version__}.",
         "Use it together with the joint correction of the same model (--format onnx): the pose is that of this "
         "geometry at q + correction. Without the correction, use a file of --geometry geometric.",
-        *condition_remarks(model),
-        *frame_remarks(model),
+        *pose_remarks(model),
     )
 
 
@@ -138,6 +137,11 @@ def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
     stated = [f"{name} {value:g}" for name, value in model.conditions.items()]
     stated += [f"{name} {mean:.4g} (mean of the calibration)" for name, mean in usual.items()]
     return (*((f"For {' and '.join(stated)}.",) if stated else ()), *condition_warnings(model))
+
+
+def pose_remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """Return remarks on the conditions, base and tool for which a file relates joint values and poses."""
+    return (*condition_remarks(model), *frame_remarks(model))
 
 
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.deployment.export.geometry import HYBRID, condition_remarks
+from pisigma.deployment.export.geometry import HYBRID, pose_remarks
 from pisigma.files.errors import ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.joint_correction.conditions import learned_conditions, with_modelled_torques
@@ -194,7 +194,7 @@ def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
         "The graph corrects joint values for forward kinematics: the pose is that of the hybrid geometry "
         "(--format urdf or dh --geometry hybrid), not of the geometric fit, at q + correction. To convert nominal "
         "to commanded joint values, export a model written by `pisigma distill`.",
-        *condition_remarks(model),
+        *pose_remarks(model),
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from lxml import etree
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.deployment.export.geometry import condition_remarks
+from pisigma.deployment.export.geometry import pose_remarks
 from pisigma.deployment.export.programs.languages import COUNTING
 from pisigma.files.errors import OutputError, Place
 from pisigma.model.calibrated_model import CalibratedModel
@@ -122,7 +122,7 @@ def _write(request: ExportRequest) -> Exported:
     comments = (
         f"Joint corrections of model {model.name} (robot {model.robot.name}) over RSI.",
         COUNTING.format(robot=model.robot.name),
-        *condition_remarks(model),
+        *pose_remarks(model),
     )
     text = rsi_configuration(address.host, address.port, comments)
     facts = model_facts(model) | {"address": f"{address.host}:{address.port}"}

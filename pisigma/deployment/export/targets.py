@@ -11,7 +11,7 @@ import torch
 
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest
-from pisigma.deployment.export.geometry import condition_remarks, frame_remarks
+from pisigma.deployment.export.geometry import pose_remarks
 from pisigma.deployment.export.programs.languages import LANGUAGES, cautions, check_program, program_text
 from pisigma.deployment.export.programs.targets import Targets, targets_of
 from pisigma.deployment.export.programs.text import millimetres_and_euler
@@ -158,6 +158,7 @@ def _write(request: ExportRequest) -> Exported:
             "rows": len(targets.line),
             "statuses": dict(statuses),
         },
+        remarks=targets.remarks,
         warnings=(
             *([targets.domain_warning] if targets.domain_warning else []),
             *(() if table else cautions(request.out, cartesian)),
@@ -263,7 +264,7 @@ def _exported(
             "joint_lines": list(scanned.joint_lines),
             "diff": diff,
         },
-        remarks=(*condition_remarks(model), *frame_remarks(model)),
+        remarks=pose_remarks(model),
         warnings=(
             TEST,
             *(language.cartesian_cautions if language else ()),

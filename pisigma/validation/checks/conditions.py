@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
+from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -17,31 +18,43 @@ _HEAVY = 200.0
 """Payload of an arm with a reach of 1 m above which a warning is given [kg]; it grows with the cube of the reach. Arms
 on the market lift less than a half of it: 10 kg at 1.1 m, 300 kg at 2.6 m, 2,300 kg at 3.7 m, 5 kg at 0.4 m (SCARA)."""
 
-
-def check_payload(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn about payloads that look like grams."""
-    rows, largest = checked.rows, _HEAVY * checked.robot.reach**3
-    if rows.payload is None:
-        return
-    heavy = (rows.payload > largest).nonzero()[:, 0].tolist()
-    if heavy:
-        most = int(torch.nan_to_num(rows.payload, nan=-torch.inf).argmax())
-        yield Diagnostic(
-            kind="payload",
-            severity="warning",
-            sentence=f"{rows.place(most)}: {float(rows.payload[most]):.4g} kg is heavy for a robot with a reach of "
-            f"{checked.robot.reach:.2f} m ({len(heavy)} of {rows.rows} rows are above {largest:.3g} kg); check whether "
-            "the values are in grams.",
-            row_places=tuple(rows.place(row) for row in heavy),
-            values={"heaviest": rows.place(most), "payload": float(rows.payload[most])},
-        )
-
-
 _MIN_SPREAD = 1.0
 """Standard deviation of the temperatures [K] above which an expansion is estimated; within a smaller one, other changes
 with time are larger."""
 _EXPANDS = 5.0
 """Ratio of the expansion to its standard deviation above which a warning is given; many effects may resemble it."""
+
+
+def check_payload(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn about payloads that look like grams."""
+    reach = checked.robot.reach
+    what = f"heavy for a robot with a reach of {reach:.2f} m"
+    yield from _above(checked.rows, "payload", _HEAVY * reach**3, "kg", "heaviest", what, "grams")
+
+
+def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn about temperatures that look like degrees Fahrenheit."""
+    unit = "degrees Fahrenheit: deg C = (deg F - 32) / 1.8"
+    yield from _above(checked.rows, "temperature", _HOT, "deg C", "hottest", "hot for a robot", unit)
+
+
+def _above(
+    rows: Measurements, name: str, limit: float, unit: str, superlative: str, what: str, other_unit: str
+) -> Iterator[Diagnostic]:
+    """Warn about values of a condition above a limit, which look like values in another unit."""
+    values = getattr(rows, name)
+    if values is None or not bool((values > limit).any()):
+        return
+    above = (values > limit).nonzero()[:, 0].tolist()
+    most = int(torch.nan_to_num(values, -torch.inf).argmax())
+    yield Diagnostic(
+        kind=name,
+        severity="warning",
+        sentence=f"{rows.place(most)}: {float(values[most]):.4g} {unit} is {what} ({len(above)} of {rows.rows} rows "
+        f"are above {limit:.3g} {unit}); check whether the values are in {other_unit}.",
+        row_places=tuple(rows.place(row) for row in above),
+        values={superlative: rows.place(most), name: float(values[most])},
+    )
 
 
 def check_expansion(checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -73,25 +86,6 @@ def check_expansion(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             "by thermal expansion of the links (0.012 mm for steel, 0.023 mm for aluminium), which is not corrected "
             "and not included in predicted errors. Calibrate and work at one temperature.",
             values={"expansion_per_k": alpha, "sigma": sigma},
-        )
-
-
-def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn about temperatures that look like degrees Fahrenheit."""
-    rows = checked.rows
-    if rows.temperature is None:
-        return
-    hot = (rows.temperature > _HOT).nonzero()[:, 0].tolist()
-    if hot:
-        most = int(torch.nan_to_num(rows.temperature, nan=-torch.inf).argmax())
-        yield Diagnostic(
-            kind="temperature",
-            severity="warning",
-            sentence=f"{rows.place(most)}: {float(rows.temperature[most]):.4g} deg C is hot for a robot "
-            f"({len(hot)} of {rows.rows} rows are above {_HOT:g} deg C); check whether the values are in degrees "
-            "Fahrenheit: deg C = (deg F - 32) / 1.8.",
-            row_places=tuple(rows.place(row) for row in hot),
-            values={"hottest": rows.place(most), "temperature": float(rows.temperature[most])},
         )
 
 

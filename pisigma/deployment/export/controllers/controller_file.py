@@ -17,7 +17,7 @@ from pisigma.deployment.export.approximation import (
 )
 from pisigma.deployment.export.dh_table import TABLE_SUFFIXES
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.deployment.export.geometry import condition_remarks, corrects_joints, frame_remarks
+from pisigma.deployment.export.geometry import corrects_joints, pose_remarks
 from pisigma.deployment.export.joint_offsets import departure_sentence, read_offsets
 from pisigma.deployment.export.registry import BUILT_IN
 from pisigma.files.errors import Place, RobotError
@@ -183,7 +183,7 @@ class ControllerFile:
                 "It does not include a learned joint correction: its geometry is the nearest approximation of the "
                 "whole model."
             )
-        sentences += [*self.requirements, *condition_remarks(model), *frame_remarks(model)]
+        sentences += [*self.requirements, *pose_remarks(model)]
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(of_nominal)}
         facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
         if described.frames:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.deployment.export.geometry import condition_remarks
+from pisigma.deployment.export.geometry import pose_remarks
 from pisigma.files.errors import OutputError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.compiled_model import describe_as_arrays
@@ -84,7 +84,7 @@ def _write(request: ExportRequest) -> Exported:
     }
     remarks = (
         f"The library is for {sys.platform} on {platform.machine()}; export it again for other platforms.",
-        *condition_remarks(model),
+        *pose_remarks(model),
     )
     return Exported(content, {**model_facts(model), "files": sorted(content)}, remarks)
 

@@ -66,7 +66,7 @@ class Program:
     def from_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
         """Return the program that moves to the targets, none of which may be missing."""
         sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
-        sentences += [*_CARTESIAN, *targets.remarks] if cartesian else []
+        sentences += [*(_CARTESIAN if cartesian else ()), *targets.remarks]
         sentences += [targets.domain_warning] if targets.domain_warning else []
         labels = [
             f"line {line}{' OUTSIDE DOMAIN' if status == Status.OUTSIDE_DOMAIN else ''}"

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma import __version__
-from pisigma.deployment.export.geometry import condition_remarks, frame_remarks
+from pisigma.deployment.export.geometry import pose_remarks
 from pisigma.files.errors import UnreachablePoseError
 from pisigma.model.inverse.solution import Solution
 from pisigma.robot.description import Robot
@@ -132,5 +132,5 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
             has_target[:, None, None], torch.nan
         ),
         sigma=deviation.double().where(has_target, torch.nan),
-        remarks=(*condition_remarks(model), *frame_remarks(model)),
+        remarks=pose_remarks(model),
     )
